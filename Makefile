@@ -13,7 +13,7 @@ UV_VERSION := 0.13.8
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo figures study coverage test test-all test-newer-jax defects fuzz lint docs dist format lock clean
+.PHONY: help demo figures study bench-first coverage test test-all test-newer-jax defects fuzz lint docs dist format lock clean
 
 help: ## List the targets
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -46,6 +46,9 @@ study: $(STAMP) ## Sweep stiffness for the README's figures (half an hour; resum
 	for figure in variance bias bias_gripper/bias bias_landing/bias achieved map/map_stiffness_sigma; do \
 		folder=$${figure%/*}; $(BIN)/mjx-study plot results/$$folder --format png || exit; \
 		cp results/$$folder/$${figure#*/}.png docs/$$folder.png || exit; done
+
+bench-first: $(STAMP) ## Measure how long first answers take, into docs/performance.md (five minutes)
+	$(BIN)/python -m experiments.first_answers --page docs/performance.md
 
 coverage: $(STAMP) ## Measure the tables of docs/coverage.md (a few minutes)
 	$(BIN)/python -m experiments.coverage

@@ -30,6 +30,7 @@ from mjx_study.graph.build import known_libraries, libraries_in, library_ready
 from mjx_study.graph.native import native_identity
 from mjx_study.identity import TraceContents, trace_contents
 from mjx_study.runtime import available_cores, precision, traces_folder
+from mjx_study.simulation.scene import Scene
 from mjx_study.structure import describe, restore
 from mjx_study.tasks.task import Task
 from mjx_study.watchdog import awaited
@@ -55,17 +56,18 @@ class Compiled:
     def __init__(self, function: Callable[..., Any], *made_of: Any):
         self.jitted = jax.jit(function)
         self._function, self._made_of = function, made_of
+        self._name = str(made_of[0]) if made_of else getattr(function, "__name__", "program")
         self._ready: dict[str, Callable[..., Any]] = {}
         self._begun: set[str] = set()
 
     @cached_property
     def _whole(self) -> Callable[..., Any]:
         """The function as a program of its own."""
-        return jax.jit(self._function, compiler_options=compiler_options())
+        return jax.jit(_named(self._function, self._name), compiler_options=compiler_options())
 
     def __call__(self, *arguments: Any) -> Any:
         with awaited():
-            return self.prepare(*arguments)(*arguments)
+            return self.executable(*arguments)(*arguments)
 
     @property
     def num_compilations(self) -> int:
@@ -92,24 +94,51 @@ class Compiled:
         ready = self.prepare(*arguments, platform=platform)
         return ready.out_info if isinstance(ready, jax.stages.Compiled) else jax.eval_shape(ready, *arguments)
 
-    def ahead(self, *types: Any) -> Callable[[], None]:
+    def ahead(self, *types: Any, options: dict[str, Any] | None = None) -> Callable[[], None]:
         """Trace the function in this thread, or load its cached trace, for compilation ahead of time.
 
         Args:
             types: shapes and types of the arguments.
+            options: XLA's options, for versions of XLA that know them.
 
         Returns:
             A function that compiles it in any thread for JAX's default device, so that the next call need not; it does
             nothing if that has begun before.
         """
-        key, leaves, form = self._form(types)
-        ready = self._prepared(key, leaves, form, types)
+        return self._begin(*self._form(types), types, options)
+
+    def executable(self, *arguments: Any) -> Callable[..., Any]:
+        """The function for arguments of this form, compiled where JAX's default device is the only one, as on CPUs.
+
+        Like `ahead`, whatever devices the arguments are on: JAX's cache holds one program for both.
+        """
+        key, types, form = self._form(arguments)
+        if jax.default_backend() == "cpu":
+            self._begin(key, types, form, arguments)()
+        return self._prepared(key, types, form, arguments)
+
+    def _begin(
+        self,
+        key: str,
+        types: list[jax.ShapeDtypeStruct],
+        form: Any,
+        arguments: Any,
+        options: dict[str, Any] | None = None,
+    ) -> Callable[[], None]:
+        """Trace the function, and return a function that compiles it unless that has begun before."""
+        ready = self._prepared(key, types, form, arguments)
         if key in self._begun:
             return lambda: None
         self._begun.add(key)
 
         def compile_it() -> None:
-            self._ready[key] = ready.lower(*types).compile()
+            lowered = ready.lower(*form.unflatten(types))
+            try:
+                self._ready[key] = lowered.compile(options)
+            except jax.errors.JaxRuntimeError:
+                if options is None:
+                    raise
+                self._ready[key] = lowered.compile()
 
         return compile_it
 
@@ -123,7 +152,7 @@ class Compiled:
         """The traced function of a form of arguments, compiled if `ahead` has."""
         if key not in self._ready:
             path = self._path(key)
-            kept = None if path is None else _read(path) or self._export(path, types, form)
+            kept = None if path is None else _read(path, self._name) or self._export(path, types, form)
             self._ready[key] = kept or self._traced(arguments)
         return self._ready[key]
 
@@ -143,7 +172,7 @@ class Compiled:
 
     def _key(self, form: str) -> str:
         """What this function's programs depend on besides its contents, for a form of arguments."""
-        simulates = any(isinstance(each, Task) for each in self._made_of)
+        simulates = any(isinstance(each, Task | Scene) for each in self._made_of)
         settings = [(name, value) for name, value in jax.config.values.items() if not UNTRACED.search(name)]
         native = native_identity() if simulates else None
         return repr((jax.default_backend(), native, precision(), settings, form))
@@ -166,7 +195,7 @@ class Compiled:
             return found
 
         try:
-            jitted = jax.jit(of_leaves)
+            jitted = jax.jit(_named(of_leaves, self._name))
             with observing(path.stem) if self._contents.own else nullcontext():
                 jitted.trace(*types)  # which names the libraries of native code that it calls
             inputs = sources_and_inputs() if self._contents.own else {}
@@ -178,7 +207,7 @@ class Compiled:
             return None
         kept = described + b"\n" + bytes(trace)
         write_cached(path, kept)
-        return _load(kept)
+        return _load(kept, self._name)
 
 
 class Builds:
@@ -226,6 +255,16 @@ def type_of(leaf: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(kind.shape, kind.dtype, weak_type=kind.weak_type)
 
 
+def _named(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """The function by a name of its own, which JAX's events and messages give."""
+
+    def program(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    program.__name__ = program.__qualname__ = name.replace(" ", "_")
+    return program
+
+
 @cache
 def _say_untraceable(opaque: tuple[str, ...]) -> None:
     """Say why programs of a task are not kept between runs."""
@@ -235,21 +274,21 @@ def _say_untraceable(opaque: tuple[str, ...]) -> None:
     )
 
 
-def _read(path: Path) -> Callable[..., Any] | None:
+def _read(path: Path, name: str) -> Callable[..., Any] | None:
     """Load the function whose trace is in a file; None if the file is missing or unreadable, a library of native code
     that it calls is missing, or an input differs."""
     kept = read_cached(path)
     try:
-        return None if kept is None or not all(map(library_ready, libraries_in(kept))) else _load(kept)
+        return None if kept is None or not all(map(library_ready, libraries_in(kept))) else _load(kept, name)
     except Exception:  # JAX may raise anything; the trace is then made and written again
         return None
 
 
-def _load(kept: bytes) -> Callable[..., Any] | None:
+def _load(kept: bytes, name: str) -> Callable[..., Any] | None:
     described, _, trace = kept.partition(b"\n")
     found: Mapping[str, Any] = json.loads(described)
     if inputs_now(found["inputs"]) != found["inputs"]:
         return None
     exported, structure = jax.export.deserialize(bytearray(trace)), restore(found["outputs"])
     call = lambda *arguments: structure.unflatten(exported.call(*jax.tree.leaves(arguments)))  # noqa: E731
-    return jax.jit(call, compiler_options=compiler_options())
+    return jax.jit(_named(call, name), compiler_options=compiler_options())

@@ -27,7 +27,7 @@ VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy
 SOURCES: Final = (".py", ".c", ".cu")
 """Suffixes of files with code."""
 NOT_COMPUTING: Final = frozenset(
-    ["cli", "plots", "render", "gradcheck", "diagnose", "claims", "bench.py", "report.py", "_public.py", "__main__.py"]
+    "authoring cli plots render gradcheck diagnose claims bench.py report.py _public.py __main__.py".split()
 )
 """Parts of mjx_study that no study imports while it computes, and so do not affect results; all others count."""
 DIGEST: Final = re.compile("[0-9a-f]{12,64}")

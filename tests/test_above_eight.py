@@ -33,6 +33,9 @@ tolerance="1e-15"/><default><joint armature=".01" damping=".1"/><geom friction="
 </body></body></body></body></worldbody>
 <actuator><position joint="hip" kp="20" kv=".5"/><position joint="knee" kp="20" kv=".5"/></actuator>
 <sensor><framelinvel objtype="site" objname="trunk"/></sensor></mujoco>"""
+BALL = """<mujoco><option timestep=".004" iterations="50" tolerance="1e-15"/><worldbody>
+<geom type="plane" size="1 1 .1" condim="1"/><body pos="0 0 .09"><joint type="slide" axis="0 0 1"/>
+<geom size=".1" condim="1" solimp=".5 .95 .1"/></body></worldbody></mujoco>"""
 SAMPLES = 11
 
 
@@ -149,6 +152,21 @@ def test_gradients_of_the_drop_in_step_are_those_of_its_values(fields: str) -> N
     np.testing.assert_allclose(along / 1e-6, (high - low) / 2e-6, rtol=1e-5, atol=1e-6)
 
 
+def test_applied_forces_have_derivatives() -> None:
+    """Of a ball in the air: h / m, along the joint and in the world."""
+    host = mujoco.MjModel.from_xml_string(BALL.replace('pos="0 0 .09"', 'pos="0 0 .5"'))
+    model, data = mjx.put_model(host), mjx.make_data(host)
+
+    def speed(along, world):
+        applied = data.replace(qfrc_applied=along, xfrc_applied=data.xfrc_applied.at[1, 2].set(world))
+        return step(model, applied).qvel[0]
+
+    point = jnp.array([0.3]), jnp.array(0.2)
+    assert str(jax.make_jaxpr(speed)(*point)).count("native[") == 1
+    along, world = compiled(jax.grad(speed, (0, 1)), *point)(*point)
+    np.testing.assert_allclose([along[0], world], host.opt.timestep / host.body_mass[1], rtol=1e-12)
+
+
 @pytest.mark.parametrize("why", ["budget", "model", "switch", "size"])
 def test_what_is_not_solved_natively_is_left_to_mjx(monkeypatch: pytest.MonkeyPatch, why: str) -> None:
     """A small budget of the solver, which native code would exceed; a traced model; by choice; beyond the limit."""
@@ -175,14 +193,7 @@ def test_second_derivatives_of_large_maps_are_those_of_jax(
 ) -> None:
     """A ball in the floor, whose stiffness varies with depth; of first derivatives in either mode."""
     monkeypatch.setattr(operation, "MOST_DIFFERENTIATED", most)
-    scene = put_scene(
-        mujoco.MjModel.from_xml_string(
-            '<mujoco><option timestep=".004" iterations="50" tolerance="1e-15"/><worldbody>'
-            '<geom type="plane" size="1 1 .1" condim="1"/><body pos="0 0 .09"><joint type="slide" axis="0 0 1"/>'
-            '<geom size=".1" condim="1" solimp=".5 .95 .1"/></body></worldbody></mujoco>'
-        ),
-        "ball",
-    )
+    scene = put_scene(mujoco.MjModel.from_xml_string(BALL), "ball")
 
     def speed(depth):
         return jnp.sum(step(scene.model, scene.template.replace(qpos=-depth)).qvel)

@@ -30,6 +30,7 @@ OF_KIND = {"--iterations": "--iterations 2 --evaluation-samples 4", "--points": 
 MJCF = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
 <body pos="0 0 0.09"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
 ORDER = (
+    "init",
     "optimise",
     "rollout",
     "compare",

@@ -288,7 +288,7 @@ def test_a_step_that_is_no_graph_has_the_same_derivative(monkeypatch: pytest.Mon
     """In both modes, by its matrix; small models keep forward mode, in which cases not taken do not count."""
     extra = 'cone="elliptic" solver="Newton"'
     expected = sliding_jacobian(extra)(at(-0.0004))
-    monkeypatch.setattr(dynamics, "_by_graph", lambda *arguments: None)
+    monkeypatch.setattr(dynamics, "by_graph", lambda *arguments: None)
     scene, point = sliding(extra), jnp.asarray(at(-0.0004))
     after = lambda x: step_flat(scene, scene.model, x, jnp.zeros(3))[0]  # noqa: E731
     traced = jax.jit(in_both_modes(after)).trace(point)

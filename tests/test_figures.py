@@ -257,7 +257,7 @@ def numbers_of(found: xr.Dataset) -> dict[tuple[str, ...], list[list[str]]]:
     """Headings of the table in a report, and its rows."""
     page = render_report(found)
     table = page[page.index("<h2>Numbers") : page.index("<h2>Configuration")]
-    headings = tuple(re.findall(r"<th>(.*?)</th>", table))
+    headings = tuple(re.findall(r"<th(?: [^>]*)?>(.*?)</th>", table))
     return {headings: [re.findall(r"<td>(.*?)</td>", row) for row in table.split("\n") if "<td>" in row]}
 
 
@@ -276,6 +276,13 @@ def test_a_report_shows_what_there_is_and_once() -> None:
         ]
     }
     page = render_report(lines)
+    figures = re.findall(r'<img alt="(.*?)"', page)
+    assert figures and all(re.fullmatch(r"\w+: .{20,}", each) for each in figures)
+    titles = dict(re.findall(r'<th title="(.*?)">(.*?)</th>', page))
+    assert (
+        all(f"<b>{heading}</b>: {meaning}" in page for meaning, heading in titles.items()) and "nan" in titles.values()
+    )
+    assert 'name="viewport"' in page and "prefers-color-scheme: dark" in page
     assert "<td>gamma</td>" in page and "<td>theta</td>" not in page and "<td>direction</td>" not in page
 
 

@@ -11,7 +11,6 @@ from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.table import count, size
 from tests.documents import content
 
 DESCENTS = (
@@ -72,13 +71,3 @@ def test_what_is_forecast_is_what_descents_do(tmp_path: Path, capsys: pytest.Cap
     assert cli.main([*DESCENTS, str(folder), "--dry-run", "--sigma", "0.3"]) == 2
     assert "holds another study" in capsys.readouterr().err
     assert content(folder) == before
-
-
-def test_figures_are_for_people(capsys: pytest.CaptureFixture[str]) -> None:
-    command = "compare pusher --contact penalty,mujoco --stiffness 10:1000:5:log --dry-run"
-    assert cli.main(command.split()) == 0
-    printed = capsys.readouterr().out
-    assert "rollouts: about 21,010, 5,000 of them differentiated\n" in printed
-    assert "arrays kept: 72 kB" in printed and "e+" not in printed
-    assert [count(7), count(1234567)] == ["7", "1,235,000"]
-    assert [size(number) for number in (0, 880, 7630, 2.44e9)] == ["0 bytes", "880 bytes", "7.6 kB", "2.4 GB"]

@@ -210,12 +210,6 @@ def test_other_versions_need_a_flag_and_are_remembered(tmp_path: Path, monkeypat
 def test_a_cell_counts_in_its_place_alone(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     swept(folder)
-    cells = folder / "cells"
-    (cells / "00000.npz").write_bytes((cells / "00001.npz").read_bytes())
-    with pytest.raises(StudyError, match="00000.npz is another cell of this study; move it away to compute it again"):
-        load_study(folder)
-    (cells / "00000.npz").unlink()
-    swept(folder)
     document = (folder / "study.json").read_text()
     axes = json.loads(document)["axes"]
     altered(folder / "study.json", axes=axes | {"model": ["penalty 11", *axes["model"][1:]]})

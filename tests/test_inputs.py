@@ -92,6 +92,12 @@ def test_a_list_of_what_are_no_numbers(content: str, tmp_path: Path) -> None:
         read_theta(path)
 
 
+def test_parameters_come_in_json_and_as_arrays(tmp_path: Path) -> None:
+    (tmp_path / "theta.json").write_text("[0.5, 2]")
+    np.save(tmp_path / "theta.npy", np.array([[0.5], [2.0]]))
+    assert read_theta(tmp_path / "theta.json")[0] == read_theta(tmp_path / "theta.npy")[0] == (0.5, 2.0)
+
+
 def test_a_long_double_may_be_too_large(tmp_path: Path) -> None:
     np.save(tmp_path / "theta.npy", np.array([np.finfo(np.longdouble).max]))
     with pytest.raises(ValueError, match="theta.npy is not a .npy array of finite numbers"):

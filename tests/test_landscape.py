@@ -281,15 +281,6 @@ def test_samples_that_are_not_finite_are_left_out_and_counted(monkeypatch: pytes
     assert np.all(arrays["slope"][1] < 0) and all(np.isfinite(arrays[name]).all() for name in ("slope", "slope_se"))
 
 
-@pytest.mark.slow
-def test_the_command_draws_a_task_that_meets_contact(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    arguments = ["landscape", "ball_wall", "--points", "3", "--samples", "8", "--contact", "penalty"]
-    assert cli.main([*arguments, "--horizon", "4", "--output", str(tmp_path)]) == 0
-    assert "theta from 0 to 1.5 rad in 3 points" in capsys.readouterr().out
-    data = load_study(tmp_path)
-    assert data["contact"].values.tolist() == ["reference", "penalty"] and data.sizes["point"] == 3
-
-
 def test_the_command_prints_and_writes(drawn: tuple[Path, str], flown: xr.Dataset) -> None:
     folder, printed = drawn
     assert (

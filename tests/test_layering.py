@@ -30,6 +30,7 @@ LAYERS = [
     "mjx_study.simulation",
     "mjx_study.options",
     "mjx_study.tasks",
+    "mjx_study.authoring",
     "mjx_study.sources",
     "mjx_study.digest",
     "mjx_study.identity",

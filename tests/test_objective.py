@@ -136,7 +136,9 @@ def test_a_chunk_of_gradients_fits_into_an_accelerators_memory(simulator):
     assert 0.2 * 2**28 < chunk(1) * planned < 2 * 2**28
 
 
-@pytest.mark.parametrize(("samples", "chunk"), [(1, 5), (10, 11), (11, 21), (100, 101), (400, 201), (10**6, 201)])
+@pytest.mark.parametrize(
+    ("samples", "chunk"), [(1, 11), (10, 11), (11, 101), (100, 101), (400, 101), (1999, 101), (10**6, 201)]
+)
 def test_cpu_chunks_have_few_sizes_for_any_number_of_devices(samples, chunk):
     device = SimpleNamespace(platform="cpu", memory_stats=lambda: None)
     assert chunk_for(samples, [device]) == chunk_for(samples, [device] * 3) == chunk

@@ -19,10 +19,11 @@ from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import HostState, converged_host, host_data
 from mjx_study.simulation.integration import integrate_position
 from mjx_study.simulation.observation import FORCES, POSITIONS, QUANTITIES, VELOCITIES, ObservedState
-from mjx_study.simulation.scene import Scene, SceneError, put_scene
+from mjx_study.simulation.scene import Scene, SceneError, load_scene, put_scene
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import check_shapes, no_cost
 from tests.scenes import floor_scene, option
+from tests.test_own_task import LIFTED
 
 SENSORS: Final = """<sensor>
   <framepos name="place" objtype="site" objname="tip"/><framequat objtype="geom" objname="box"/>
@@ -318,3 +319,22 @@ def test_an_error_in_a_cost_names_its_line() -> None:
     line = final_cost.__code__.co_firstlineno + 1
     with pytest.raises(ValueError, match=rf"^mine: the final_cost raised AttributeError: .*\(.*line {line}\)$"):
         check_shapes(task, "mine")
+
+
+@pytest.mark.slow
+def test_the_pages_costs_of_feet() -> None:
+    """As they stand there, of the robot at rest: its feet do not slide but carry weight, and are on the floor."""
+    scene = load_scene("quadruped")
+    namespace: dict[str, Any] = {"jnp": jnp}
+    exec(LIFTED, namespace)
+    running_cost, final_cost = namespace["lifted"](scene)
+    host, keyframe = scene.host, scene.host.key_qpos[0] if scene.host.nkey else None
+    state = initial_state(scene, None if keyframe is None else jnp.asarray(keyframe))
+    control = jnp.zeros(host.nu)
+    data = in_engine(scene, None, state, control)
+    feet = [scene.geom(name) for name in ("hind_left_foot", "hind_right_foot")]
+    forces = sum(engine_force(host, data, foot, scene.geom("floor"))[2] ** 2 for foot in feet)
+    found = jax.jit(lambda state: running_cost(observed(scene, state, None, control), control))(state)
+    np.testing.assert_allclose(found, 1e-4 * forces, rtol=1e-4)
+    expected = np.sum((data.geom_xpos[feet, 2] - 0.1) ** 2)
+    np.testing.assert_allclose(final_cost(observed(scene, state)), expected, rtol=1e-9)

@@ -192,6 +192,8 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("sweep --output out", "no task: name one, or give --config"),
         ("sweep pusher --config nowhere.toml --output out", "cannot read nowhere.toml: No such file or directory"),
         ("sweep pusher --cluster local:0 --output out", "argument --cluster: must be local:N, slurm:N or an address"),
+        ("sweep pusher --cluster localhost:1 --output out", "argument --cluster: must be local:N, slurm:N or an addr"),
+        ("sweep pusher --cluster slurm:x --output out", "argument --cluster: must be local:N, slurm:N or an address"),
         ("optimise double_pendulum --reference --stiffness 3", "--stiffness has no effect: double_pendulum names no"),
         ("optimise pusher --reference --window 3", "--window has no effect on zobg, fobg, aobg: omit it"),
         ("optimise pusher --reference --contact penalty", "--contact penalty is what --reference replaces: omit one"),

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from estimators import Evaluation, delta_control_variate, first_order
-from mjx_study.experiment.reference_gradient import estimate_reference
+from estimators import Evaluation, GradientEstimate, delta_control_variate, first_order, summarise
+from mjx_study.experiment.reference_gradient import TARGET, averaged, estimate_reference, uncertainty
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import SIGMA, penalty, pusher_simulator, pusher_task, sample_keys
 
@@ -74,6 +74,31 @@ def test_non_finite_samples_of_the_pilot_do_not_poison_it():
     result = estimate_reference(odd_batch(1000, 1), broken, [jnp.asarray(EXACT)], NOISE)
     assert result.num_nonfinite == 0 and np.all(np.isfinite(result.per_sample))
     assert result.variance < 0.5 * estimate_reference(odd_batch(1000, 1), pilot, [], NOISE).variance
+
+
+@pytest.mark.parametrize(("scale", "parts"), [(0.01, 1), (0.4, 4), (30.0, 8)])
+def test_as_many_references_are_averaged_as_a_verdict_needs(scale: float, parts: int) -> None:
+    """Noise of 0.4 times the gradient's norm in 20 samples is uncertain by 9 %; the mean is that of all samples."""
+    drawn: list[np.ndarray] = []
+
+    def part(index: int) -> GradientEstimate:
+        noise = np.random.default_rng(index).standard_normal((20, 1))
+        drawn.append(1 + scale * (noise - noise.mean()) / noise.std(ddof=1))
+        return summarise(jnp.asarray(drawn[-1]))
+
+    found, used = averaged(part, 8)
+    assert used == parts == len(drawn)
+    assert uncertainty(found) <= TARGET or used == 8
+    np.testing.assert_allclose(found.mean, np.mean(np.concatenate(drawn)), rtol=1e-12)
+    assert found.per_sample.shape == (20, 1)
+
+
+def test_lost_samples_cost_their_rows_no_others() -> None:
+    """A row that is finite in one part only is that part's; one that is in none stays lost."""
+    rows = [np.array([[1.0], [np.nan], [3.0], [np.nan]]), np.array([[3.0], [5.0], [np.inf], [np.nan]])]
+    found, used = averaged(lambda index: summarise(jnp.asarray(rows[index])), 2)
+    assert used == 2 and found.num_nonfinite == 1
+    np.testing.assert_array_equal(found.per_sample, [[2.0], [5.0], [3.0], [np.nan]])
 
 
 @pytest.mark.slow

@@ -454,20 +454,6 @@ def test_ffmpegs_failure_is_one_line_and_leaves_nothing(tmp_path: Path, monkeypa
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_an_interrupted_film_is_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither a half-written file nor a temporary one stays, and an older film survives."""
-    path = tmp_path / "film.gif"
-    path.write_bytes(b"older")
-
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("mjx_study.disk.os.replace", stop)
-    with pytest.raises(KeyboardInterrupt):
-        animate(throw(seconds=0.1), path, renderer="drawing")
-    assert [item.name for item in tmp_path.iterdir()] == ["film.gif"] and path.read_bytes() == b"older"
-
-
 @pytest.fixture
 def fresh_backend() -> Generator[None]:
     """What OpenGL can do here is found out anew, before and after."""

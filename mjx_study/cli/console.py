@@ -135,12 +135,11 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
     lines.append("")
     uncertainty = [row.reference_uncertainty for row in rows if math.isfinite(row.reference_uncertainty)]
     if uncertainty:
-        low, high = number(min(uncertainty), 2), number(max(uncertainty), 2)
+        pairs = dataset.get("reference_pairs", xr.DataArray(config["reference_samples"])).values
         lines += [
-            f"Errors are against an unbiased zeroth-order reference gradient, {config['reference_samples']} pairs "
+            f"Errors are against an unbiased zeroth-order reference gradient, {_range(pairs, 9)} pairs "
             "of rollouts with a control variate;",
-            f"its own relative uncertainty is {low if low == high else f'{low} to {high}'}, and smaller errors are "
-            "not significant.",
+            f"its own relative uncertainty is {_range(uncertainty, 2)}, and smaller errors are not significant.",
             MARKS,
         ]
     lines.append("ms: computing time of one sample; variance x s: the variance times it, in seconds.")
@@ -150,6 +149,12 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
             "number nor its error."
         )
     return lines + [f"{sentence}." for sentence in document["findings"]]
+
+
+def _range(values: Any, digits: int) -> str:
+    """The smallest and the largest finite value, or the only one."""
+    low, high = number(float(np.nanmin(values)), digits), number(float(np.nanmax(values)), digits)
+    return low if low == high else f"{low} to {high}"
 
 
 def rows_as_json(dataset: xr.Dataset) -> dict[str, Any]:

@@ -9,10 +9,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
+from mjx_study.cli.display import TICK, Activity, Display, Show, ticking
 from mjx_study.disk import remove_temporary_folders
 from mjx_study.progress import Progress
 
@@ -107,30 +108,43 @@ def _leave(message: str, code: int) -> NoReturn:
 
 @contextmanager
 def shown_progress() -> Generator[Progress]:
-    """Show a bar on a terminal until the work is done; otherwise print a line per stage with the elapsed time."""
-    if sys.stderr is None or not sys.stderr.isatty():
-        yield _stage_lines()
-        return
+    """Show a live bar on a terminal until the work is done; otherwise print a line per stage with the elapsed time, and
+    one after each silence."""
+    activity = Activity()
+    with ExitStack() as stack:
+        stack.enter_context(activity.listening())
+        if sys.stderr is not None and sys.stderr.isatty():
+            display = Display(stack.enter_context(_bar(activity)), activity, within=0.0, silence=TICK)
+        else:
+            display = Display(_lines(), activity)
+        stack.enter_context(ticking(display.tick))
+        yield display.report
+
+
+@contextmanager
+def _bar(activity: Activity) -> Generator[Show]:
+    """A bar on the terminal, with what is built at the moment."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
-        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
+
+        def show(done: int, total: int, what: str, life: str) -> None:
+            bar.update(task, completed=done, total=total or None, description=f"{what}: {life}" if life else what)
+
+        yield show
 
 
-def _stage_lines() -> Progress:
-    """Print a line for each stage, identified by its name; progress within a stage is not shown."""
-    begun, last = time.monotonic(), ""
+def _lines() -> Show:
+    """A line for each stage, and for each sign of life."""
+    begun = time.monotonic()
 
-    def report(done: int, total: int, what: str) -> None:
-        nonlocal last
-        if what != last:
-            complain(f"{time.monotonic() - begun:7.1f} s  [{done}/{total}] {what}")
-            last = what
+    def show(done: int, total: int, what: str, life: str) -> None:
+        complain(f"{time.monotonic() - begun:7.1f} s  {life or f'[{done}/{total}] {what}'}")
 
-    return report
+    return show
 
 
 def attempt(write: Callable[[], list[Path]]) -> tuple[list[Path], str | None]:

@@ -69,14 +69,17 @@ def advise(found: Diagnosis) -> Iterator[Advice]:
 
 
 def _best(found: Diagnosis) -> Advice:
-    best, bias = found.best, found.bias_text(found.best)
+    best, bias, needed = found.best, found.bias_text(found.best), ""
     if math.isfinite(found.samples_needed):
         many = round_up(found.samples_needed)
-        needed = f"a relative error of {percent(TARGET_ERROR)} needs {many} sample{'' if many == '1' else 's'}"
-        needed += f"; its bias of {bias} remains" if best.verdict == "biased" else ""
-    else:
-        needed = f"its bias of {bias} remains, however many samples"
-    return f"at {found.setting.level}, take {best.estimator}; {needed}", ""
+        needed = f"; a relative error of {percent(TARGET_ERROR)} needs {many} sample{'' if many == '1' else 's'}"
+    if best.verdict == "undecided":
+        needed += f"; whether its mean is right is undecided (it may be off by {bias}): more --samples decide that"
+    elif not needed:
+        needed = f"; its bias of {bias} remains, however many samples"
+    elif best.verdict == "biased":
+        needed += f"; its bias of {bias} remains"
+    return f"at {found.setting.level}, take {best.estimator}{needed}", ""
 
 
 def _bias(found: Diagnosis) -> Advice:

@@ -15,10 +15,12 @@ import numpy as np
 
 from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
 from estimators.mean_check import NODES
+from mjx_study.compiled import Builds
 from mjx_study.diagnose.means import MAX_PATHS, along_means, reach_of, unmixed
 from mjx_study.experiment.sampling import cell_keys, draw_batches, unconverged
 from mjx_study.experiment.tally import onset_numbers
-from mjx_study.objective import Simulator, chunk_for
+from mjx_study.objective import BlankObjective, Simulator, chunk_for
+from mjx_study.progress import Progress, silent
 from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import local_devices, precision
 from mjx_study.simulation.contact import ContactModel
@@ -30,9 +32,9 @@ SAMPLES: Final = 500
 """Samples per batch, if time allows."""
 BUDGET_SECONDS: Final = 60.0
 """Time for all batches, compilation excluded [s]."""
-CHUNKS: Final = (32, 8)
-"""Samples per program call on a CPU, for small and large models: a call takes the time of all of them, however few are
-requested."""
+LARGE_CHUNK: Final = 8
+"""Samples per program call on a CPU for large models: a call takes the time of all of them, however few are
+requested. Small ones share the programs of studies."""
 SMALL_MODEL: Final = (8, 32)
 """Maximum numbers of degrees of freedom and constraint rows of a small model."""
 RESOLVED_SE: Final = 2.0
@@ -138,8 +140,8 @@ def chunk_of(task: Task, samples: int) -> int:
     """Number of samples per program call."""
     devices, size = local_devices(), (task.scene.host.nv, num_constraint_rows(task.scene.template))
     large = any(number > most for number, most in zip(size, SMALL_MODEL, strict=True))
-    most = CHUNKS[large] if devices[0].platform == "cpu" else samples + 1
-    return min(chunk_for(samples, devices, [task]), most)
+    usual = chunk_for(samples, devices, [task])
+    return min(usual, LARGE_CHUNK) if large and devices[0].platform == "cpu" else usual
 
 
 def affordable(seconds: float, chunk: int) -> int:
@@ -154,7 +156,11 @@ def affordable(seconds: float, chunk: int) -> int:
 
 
 def measure(
-    simulator: Simulator, contact: ContactModel | None, samples: int | None = None, seed: int = 0
+    simulator: Simulator,
+    contact: ContactModel | None,
+    samples: int | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
 ) -> Measurement:
     """Measure the estimators at the task's theta, without the contacts and step derivatives of a diagnosis.
 
@@ -163,6 +169,7 @@ def measure(
         contact: the contact model; None for the MJCF's.
         samples: see `diagnose_task`.
         seed: random seed.
+        progress: called before each part.
     """
     task = simulator.task
     chosen = estimators_of(task)
@@ -171,12 +178,20 @@ def measure(
     def drawn(count: int):
         return draw_batches(objective, task.theta, keys, oracles, count, slice(1))
 
-    drawn(1)  # compiles
+    progress(0, 3, "programs")
+    builds = Builds()
+    for oracle in oracles:
+        blank = BlankObjective(**vars(objective), builds=builds)
+        getattr(blank, ORACLES[oracle].method)(task.theta, jax.random.split(jax.random.key(0), 1))
+    builds.wait()
+    drawn(1)
     if samples is None:
         samples = affordable(sum(drawn(1)[1].values()), simulator.chunk_size)
+    progress(1, 3, f"batches of {samples} samples")
     batches, seconds, residuals = drawn(samples)
     batches = jax.tree.map(lambda leaf: leaf[0], batches)
     reach, first = reach_of(task), [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
+    progress(2, 3, "means along paths")
     along = along_means(first, objective, task.theta, reach, unmixed(chosen, batches), samples, seed)
     paths: dict[Estimator, tuple[Circulation, ...]] = dict(zip(first, zip(*along, strict=True), strict=True))
     found = [

@@ -87,7 +87,8 @@ def page_lines(found: Diagnosis) -> list[str]:
     lines += [f"{check} --mean --direction {ALONG_MEANS} {batch}", f"{compare} {batch}", "", "advice"]
     for text, flags in advise(found):
         lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
-        lines += [f"{compare} {flags}"] if flags else []
+        shown = f"{compare} {flags}"
+        lines += [shown] if flags and shown not in lines else []
     return lines
 
 

@@ -1,5 +1,6 @@
 """Run all measurements of a diagnosis, in order."""
 
+import dataclasses
 from typing import Final
 
 from mjx_study.choices import is_file, takes_stiffness
@@ -16,6 +17,8 @@ from mjx_study.tasks.task import Task
 
 STATES: Final = 2
 """Number of states in the gradient check."""
+PARTS: Final = ("rollout without noise", "derivatives of steps", "estimators")
+"""Names of the parts in progress."""
 
 
 def diagnose_task(
@@ -48,18 +51,22 @@ def diagnose_task(
     check_soundness(task)
     cell, warnings = single_contact(task, family, stiffness, damping)
     check_memory(task, estimators_of(task), samples or SAMPLES)
-    progress(0, 4, "rollout without noise")
+    progress(0, 4, PARTS[0])
     touches = tuple(touches_of(task, cell))
-    progress(1, 4, "derivatives of steps")
     common = {"seed": seed, "damping": damping, "states": STATES}
     if is_file(subject):
         plan = plan_scene_gradcheck(task.scene, [cell.family], None, horizon=task.horizon, **common)
     else:
         stiffnesses = [cell.stiffness_or_zero] if takes_stiffness([cell.family]) else None
         plan = plan_gradcheck(task, [cell.family], stiffnesses, **common)
-    derivatives = gradcheck(plan)
-    progress(2, 4, "estimators")
-    found = measure(Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES)), cell.contact, samples, seed)
+    plan = dataclasses.replace(plan, parameters=False)  # on which no gradient over theta depends
+
+    def part(at: int) -> Progress:
+        return lambda done, total, what: progress(at, 4, f"{PARTS[at]}: {what}") if what != "done" else None
+
+    derivatives = gradcheck(plan, part(1))
+    simulator = Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES))
+    found = measure(simulator, cell.contact, samples, seed, part(2))
     progress(4, 4, "done")
     return Diagnosis(
         **vars(found),

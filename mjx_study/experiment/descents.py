@@ -23,22 +23,24 @@ from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, draw
 from estimators.sampling import draw_at, sample_keys
-from mjx_study.compiled import Compiled
+from mjx_study.compiled import Builds, Compiled
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
 from mjx_study.experiment.memory import check_memory
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
-from mjx_study.objective import Simulator, TracedObjective, simulate
+from mjx_study.objective import Simulator, TracedObjective, chunk_for, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.reference import Reference
 from mjx_study.results.findings import descent_findings
 from mjx_study.results.kind import Drawing
 from mjx_study.results.variables import DESCENTS, HISTORY, METRIC, START
+from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel, soften
 from mjx_study.simulation.observation import observed
+from mjx_study.table import number
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Recipe, Task
 
@@ -60,6 +62,7 @@ class Descents(StudyKind):
     columns = ("final_cost", "stopped_seeds", "variance", "alpha", "nonfinite")
     compared = finite = "final_cost"
     computed = "rollouts"
+    one_program = True
 
     def axes(self, config: Mapping[str, Any]) -> dict[str, Sequence[int]]:
         return {"iteration": range(1, (config["iterations"] or 0) + 1)}
@@ -140,9 +143,17 @@ class DescentComputation(Computation):
         backend, kept = self._backends[key], dict(checkpoint.kept)
         chosen = estimators_of(self._plan, cell)
         runs = [_Run(backend, cell.model, each, index, kept, checkpoint) for index, each in enumerate(chosen)]
+        backend.costs = {run.estimator.name: (run.already, math.nan) for run in runs}
+        builds = Builds()
+        for run in runs:
+            run.build(builds)
+        backend.build_evaluation(cell.model, builds)
+        builds.wait()
         with ThreadPoolExecutor(backend.threads) as pool:
             each_in_turn = map if backend.threads == 1 else pool.map
             list(each_in_turn(_Run.descend, runs))
+        total = len(chosen) * backend.recipe.iterations
+        checkpoint.report(total, total, "evaluating the final policies")
         numbers = [run.numbers() for run in runs]
         found = {name: np.stack([each[name] for each in numbers], axis=-1) for name in numbers[0] if name != "theta"}
         found["theta"] = np.stack([each["theta"] for each in numbers], axis=1)  # (seed, estimator, param)
@@ -162,7 +173,11 @@ class Backend:
         self.config, self.seeds = config, config.batches
         self.optimizer = make_optimizer(config.settings.optimizer, self.recipe.learning_rate, self.recipe.decay)
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
+        evaluation = chunk_for(config.settings.evaluation_samples, local_devices(), [self.task])
+        chunk = plan.chunk_size if config.chunk_size else evaluation
+        self._evaluation = self.simulator and Simulator(self.task, chunk_size=chunk)
         self.saving = threading.Lock()
+        self.costs: dict[str, tuple[int, float]] = {}  # iterations and last cost by estimator
         iterations = self.recipe.iterations
         self._stiffness = schedule_factors(config.stiffness_schedule, iterations, most=1.0)
         self._sigma = self.task.sigma * schedule_factors(config.sigma_schedule, iterations)
@@ -199,13 +214,7 @@ class Backend:
                 made_of = "descent", estimator, self.optimizer, self.task, self.samples, simulator.chunk_size
                 self._iterations[estimator] = Compiled(simulated_update, *made_of)
             simulated = self._iterations[estimator]
-
-            def on_device(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
-                factor, contact = self._stiffness[index], model.contact
-                contact = contact if contact is None or factor == 1 else soften(contact, factor)
-                return simulated(contact, self._sigma[index], state, keys)
-
-            return on_device
+            return lambda *arguments: simulated(*self._on_device(model, *arguments))
         compiled = self._iterations.setdefault(estimator, jax.jit(update))
         count = max(1, TOGETHER // self.samples)
 
@@ -217,6 +226,24 @@ class Backend:
             return compiled(state, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
 
         return on_host
+
+    def build(self, estimator: Estimator, builds: Builds, model: ContactPoint, *arguments: Any) -> None:
+        """Trace the program of `iteration` for its arguments and begin to compile it, where it is one for all
+        devices."""
+        program = self._iterations[estimator]
+        if isinstance(program, Compiled) and jax.default_backend() == "cpu":
+            builds.start(program, *self._on_device(model, *arguments))
+
+    def build_evaluation(self, model: ContactPoint, builds: Builds) -> None:
+        """Begin to compile the program of `cost`."""
+        if self._evaluation is not None:
+            self._evaluation.build("value", self.task.theta, model.contact, self.task.sigma, builds)
+
+    def _on_device(self, model: ContactPoint, state: Descent, keys: Key[Array, " seeds"], index: int) -> Any:
+        """Arguments of a simulated iteration."""
+        factor, contact = self._stiffness[index], model.contact
+        contact = contact if contact is None or factor == 1 else soften(contact, factor)
+        return contact, self._sigma[index], state, keys
 
     def _together(
         self,
@@ -237,7 +264,7 @@ class Backend:
 
     def cost(self, theta: Float[Array, " params"], model: ContactPoint) -> tuple[float, float]:
         """Mean cost with noise at theta, over samples with the same noise for every theta, and its standard error."""
-        analytic, simulator = self.task.analytic, self.simulator
+        analytic, simulator = self.task.analytic, self._evaluation
         objective = analytic(model.stiffness_or_zero) if simulator is None else simulator.objective(model.contact)
         value = np.asarray(objective.evaluate(theta, self._evaluation_keys()).value)
         value = value[np.isfinite(value)]
@@ -282,7 +309,7 @@ class _Run:
     checkpoint: Checkpoint
 
     def __post_init__(self) -> None:
-        """Begin at the start, or restore a run from its checkpoint; and compile an iteration."""
+        """Begin at the start, or restore a run from its checkpoint."""
         backend, index = self.backend, self.index
         self.state = begin(backend.optimizer, backend.task.theta, backend.seeds)
         self.records: list[Record] = []
@@ -297,9 +324,16 @@ class _Run:
         fold_in = jax.vmap(jax.random.fold_in, (0, None))
         self._keys_of = jax.jit(lambda iteration: fold_in(jax.random.clone(keys), iteration))
         self._iterate = backend.iteration(self.estimator, self.model)
-        if self.already < backend.recipe.iterations and bool(jnp.any(going(self.state))):
-            first = self._keys_of(self.already)
-            jax.block_until_ready(self._iterate(self.state, first, self.already))  # compile; discard the result
+
+    @property
+    def _goes_on(self) -> bool:
+        return self.already < self.backend.recipe.iterations and bool(jnp.any(going(self.state)))
+
+    def build(self, builds: Builds) -> None:
+        """Begin to compile an iteration."""
+        if self._goes_on:
+            first = self._keys_of(self.already), self.already
+            self.backend.build(self.estimator, builds, self.model, self.state, *first)
 
     def _restore(self) -> None:
         """Take state, records and times from the checkpoint; KeyError or ValueError if it is not of this run."""
@@ -324,6 +358,8 @@ class _Run:
     def descend(self) -> None:
         """Run the remaining iterations, writing a checkpoint now and then and at the end."""
         iterations, done, pending = self.backend.recipe.iterations, self.already, []
+        if self._goes_on:  # the first call takes longer; its result is discarded
+            jax.block_until_ready(self._iterate(self.state, self._keys_of(done), done))
         last = saved = time.perf_counter()
         while done < iterations and (pending or bool(jnp.any(going(self.state)))):
             self.state, record = self._iterate(self.state, self._keys_of(done), done)
@@ -331,8 +367,7 @@ class _Run:
             done += 1
             if len(pending) >= REPORT_EVERY:
                 last = self._collect(pending, last)
-                total = len(self.backend.config.estimators) * iterations
-                self.checkpoint.report(self.index * iterations + done, total, self.estimator.name)
+                self._report(done)
                 if last - saved > SAVE_SECONDS:
                     self._save()
                     saved = last = time.perf_counter()
@@ -340,6 +375,17 @@ class _Run:
             self._collect(pending, last)
         if done > self.already:
             self._save()
+
+    def _report(self, done: int) -> None:
+        """Report the progress of all estimators, and their costs so far."""
+        backend = self.backend
+        with backend.saving:
+            costs = np.asarray(self.records[-1].cost)
+            costs = costs[np.isfinite(costs)]
+            backend.costs[self.estimator.name] = done, float(np.mean(costs)) if len(costs) else math.nan
+            total = len(backend.costs) * backend.recipe.iterations
+            shown = ", ".join(f"{name} {number(cost, 4)}" for name, (_, cost) in backend.costs.items())
+            self.checkpoint.report(sum(each for each, _ in backend.costs.values()), total, f"descent; cost: {shown}")
 
     def _collect(self, pending: list[Record], since: float) -> float:
         """Fetch records from the device, and return when they arrived."""

@@ -137,7 +137,9 @@ def _of_seeds(numbers: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
     }
     first = numbers[0]  # the reference's numbers are the same for every estimator and seed
     arrays["gradient"] = np.stack([row["gradient"] for row in numbers], axis=1)
-    return arrays | {name: np.asarray(first[name][0]) for name, variable in GRADIENTS.items() if not variable.dims}
+    return arrays | {
+        name: np.asarray(first[name][0]) for name in first if name in GRADIENTS and not GRADIENTS[name].dims
+    }
 
 
 def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:

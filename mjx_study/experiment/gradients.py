@@ -42,7 +42,13 @@ from mjx_study.experiment.memory import (
     check_batches,
 )
 from mjx_study.experiment.merged_samples import REFERENCE_UNIT, Blocks, pack
-from mjx_study.experiment.reference_gradient import CANDIDATES, reference_of, soft_gradient
+from mjx_study.experiment.reference_gradient import (
+    CANDIDATES,
+    averaged,
+    most_parts,
+    reference_of,
+    soft_gradient,
+)
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, sample_keys
 from mjx_study.experiment.study import Computation, Result, StudyCell, StudyKind, StudyPlan, Work, done, estimators_of
 from mjx_study.experiment.tally import Tally
@@ -64,7 +70,7 @@ class Gradients(StudyKind):
 
     name, title = "gradients", "gradient estimates"
     variables = GRADIENTS
-    optional = (*ONSETS, "gradient", "reference")
+    optional = (*ONSETS, "gradient", "reference", "reference_pairs")
     columns = ("variance", "effective_samples", "top_share", "relative_error", "debiased_error", "squared_bias")
     columns = (*columns, "alpha", "nonfinite")
     compared = "variance"
@@ -179,9 +185,10 @@ class GradientComputation(Computation):
     def _keys(self) -> dict[str, Any]:
         return cell_keys(self._config.seed, self._config.batches)
 
-    @property
-    def _reference_keys(self) -> tuple[Key[Array, " pairs"], Key[Array, " samples"]]:
+    def _keys_of_reference(self, index: int = 0) -> tuple[Key[Array, " pairs"], Key[Array, " samples"]]:
+        """Keys of the pairs of a part of the reference, and of the candidates, which all parts share."""
         odd, candidate = self._keys["reference"]
+        odd = jax.random.fold_in(odd, index) if index else odd
         pairs = self._config.settings.reference_samples
         return jax.random.split(odd, pairs), jax.random.split(candidate, CANDIDATES)
 
@@ -206,7 +213,7 @@ class GradientComputation(Computation):
         objective = self._objective(cell)
         keys = sample_keys(self._keys["order"][0][0], 0, min(cell.samples, PILOT))
         pilot = objective.evaluate(self._plan.task_of(cell).theta, keys)
-        return {"reference": np.asarray(self._reference(cell, objective, pilot).per_sample)}
+        return {"reference": np.asarray(self._reference(cell, objective, pilot)[0].per_sample)}
 
     def _block(self, cell: StudyCell, unit: int) -> Arrays:
         """Summary of a block."""
@@ -248,6 +255,7 @@ class GradientComputation(Computation):
         together, each = seeds_together(self._plan, cell), self._seeds_of_statistics(cell)
         pad = partial(padded, size=self._plan.padded_samples(cell))
         reference: GradientEstimate | None = None
+        pairs = 0
         parts: list[Future[Any]] = []
 
         def statistics(drawn: Any, seconds: Any, residuals: Any, keys: Any) -> Any:
@@ -267,7 +275,8 @@ class GradientComputation(Computation):
             assert reference is not None
             numbers, tallies = zip(*(part.result() for part in parts), strict=True)
             joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *numbers)
-            return cell_numbers(joined, reference, chosen, tallies, cell.samples * config.batches)
+            found = cell_numbers(joined, reference, chosen, tallies, cell.samples * config.batches)
+            return found | {"reference_pairs": np.array(float(pairs))}
 
         for start in range(0, config.batches, together):
             some = slice(start, start + together)
@@ -275,7 +284,7 @@ class GradientComputation(Computation):
             if reference is None:
                 pilot = jax.tree.map(lambda leaf: leaf[0, :PILOT], drawn[0]["evaluation"])
                 with self._device:
-                    reference = self._reference(cell, objective, pilot)
+                    reference, pairs = self._reference(cell, objective, pilot)
             if parts:
                 parts[-1].result()  # keep at most two groups of seeds in memory
             parts.append(self._in_order(partial(statistics, *drawn, tests[some])))
@@ -317,17 +326,28 @@ class GradientComputation(Computation):
             size, drawn = self._plan.padded_samples(cell), {name: batches[name] for name in self._plan.oracles}
             drawn = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((seeds, size, *leaf.shape[1:]), leaf.dtype), drawn)
             pilot = blank.evaluate(task.theta, jax.random.split(jax.random.key(0), min(cell.samples, PILOT)))
-            reference = reference_of(task, blank, *self._reference_keys, pilot, None)
+            reference = reference_of(task, blank, *self._keys_of_reference(), pilot, None)
             keys = jax.random.split(self._keys["test"], config.batches)[:seeds]
             types = drawn, type_of(np.asarray(size)), jax.tree.map(type_of, reference), type_of(keys)
             self._builds.start(seed_numbers(estimators_of(self._plan, cell), config.confidence), *types)
         self._builds.wait()
 
-    def _reference(self, cell: StudyCell, objective: MjxObjective | Reference, pilot: Evaluation) -> GradientEstimate:
+    def _reference(
+        self, cell: StudyCell, objective: MjxObjective | Reference, pilot: Evaluation
+    ) -> tuple[GradientEstimate, int]:
+        """The reference gradient of a cell, and its number of pairs."""
         softened = cell.group, cell.sigma
         if softened not in self._soft and cell.model.contact is not None:
             self._soft[softened] = soft_gradient(
-                self._objectives.simulator(cell.group), cell.sigma, self._reference_keys[1]
+                self._objectives.simulator(cell.group), cell.sigma, self._keys_of_reference()[1]
             )
         soft = None if cell.model.contact is None else self._soft[softened]
-        return reference_of(self._plan.task_of(cell), objective, *self._reference_keys, pilot, soft)
+        task = self._plan.task_of(cell)
+
+        def part(index: int) -> GradientEstimate:
+            return reference_of(task, objective, *self._keys_of_reference(index), pilot, soft)
+
+        pairs = self._config.settings.reference_samples
+        given = self._config.reference_samples is not None
+        reference, parts = averaged(part, 1 if given else most_parts(task, pairs))
+        return reference, parts * pairs

@@ -79,7 +79,8 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
         groups.append(group)
     most = max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * kind.batches_at_once(config)
     tasks = [group.task for group in groups]
-    size = config.chunk_size or chunk_for(min(largest_batch(), most), local_devices(), tasks)
+    most = min(largest_batch(), most)
+    size = config.chunk_size or chunk_for(most, local_devices(), tasks, own_program=kind.one_program)
     plan = StudyPlan(config, tuple(groups), tuple(cells), size, tuple(dict.fromkeys(messages)))
     kind.check_memory(plan)
     for cell in {cell.group: cell for cell in cells}.values():

@@ -9,7 +9,7 @@ under any contact:
   since beyond some stiffness the local ones are noise; a pilot batch selects candidate and slope.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
@@ -28,6 +28,15 @@ from mjx_study.tasks.task import Task
 
 CANDIDATES: Final = 100
 """Number of first-order samples whose median is a candidate for the control variate."""
+
+
+TARGET: Final = 0.05
+"""Relative uncertainty with which a reference tells a notable bias from none."""
+MOST_PARTS: Final = 32
+"""Maximum number of references that are averaged to reach it."""
+MOST_STEPS: Final = {True: 2_000_000, False: 100_000}
+"""Maximum number of simulated steps for that, about ten seconds of a core, for models whose step is a graph and for
+others; not a time, so that numbers are the same on any machine."""
 
 
 def estimate_reference(
@@ -94,6 +103,47 @@ def reference_of(
     padding = padded_size(len(pilot.value)) - len(pilot.value)
     pilot = jax.tree.map(lambda leaf: np.pad(leaf, [(0, padding)] + [(0, 0)] * (leaf.ndim - 1)), pilot)
     return _reference_gradient(objective.evaluate_odd(task.theta, odd_keys), pilot, candidates, objective.sigma)
+
+
+def most_parts(task: Task, pairs: int) -> int:
+    """Number of references of so many pairs that `averaged` may take for a task."""
+    return max(1, min(MOST_PARTS, MOST_STEPS[task.scene.uses_graph] // (2 * pairs * task.horizon)))
+
+
+def averaged(draw_part: Callable[[int], GradientEstimate], most: int) -> tuple[GradientEstimate, int]:
+    """Average independent references until the uncertainty is at most `TARGET`, or all are used.
+
+    Args:
+        draw_part: returns a reference by index.
+        most: number of references that there are.
+
+    Returns:
+        The reference, whose rows are means over rows of its parts, so that compiled statistics serve any number; and
+        the number of parts.
+    """
+    estimate = draw_part(0)
+    rows = np.asarray(estimate.per_sample)
+    total, count, used = np.zeros_like(rows), np.zeros((len(rows), 1), rows.dtype), 0
+    while used == 0 or (used < most and not uncertainty(estimate) <= TARGET):
+        for index in range(used, max(1, min(2 * used, most))):
+            rows = rows if index == 0 else np.asarray(draw_part(index).per_sample)
+            finite = np.all(np.isfinite(rows), axis=1, keepdims=True)
+            total, count = total + np.where(finite, rows, 0), count + finite
+        used = max(1, min(2 * used, most))
+        if used > 1:
+            with np.errstate(invalid="ignore"):
+                estimate = _summarise(total / count)
+    return estimate, used
+
+
+def uncertainty(reference: GradientEstimate) -> float:
+    """Standard error of a reference relative to its norm; NaN if it is 0 or no sample is finite."""
+    with np.errstate(all="ignore"):
+        error = np.sqrt(np.asarray(reference.variance) / np.asarray(reference.num_finite))
+        return float(error / np.linalg.norm(np.asarray(reference.mean)))
+
+
+_summarise = jax.jit(estimators.summarise)
 
 
 def takes_candidates(task: Task) -> bool:

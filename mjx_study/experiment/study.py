@@ -222,6 +222,8 @@ class Computation(ABC):
 class StudyKind(StudyResults):
     """A kind of study: how a configuration is checked, and how a cell is computed."""
 
+    one_program: bool = False
+    """Whether all of a cell's samples run inside one program, made for their number."""
     first_order: bool = False
     """Whether cells have means of first-order gradients whatever the estimators are."""
 

@@ -43,6 +43,7 @@ class GradcheckPlan:
         states: number of states per contact model.
         seed: random seed of initial states, states and directions.
         stock: whether to check the derivative of `mjx.step` too.
+        parameters: whether to check derivatives with respect to contact parameters.
     """
 
     subject: Task
@@ -52,6 +53,7 @@ class GradcheckPlan:
     states: int
     seed: int
     stock: bool
+    parameters: bool = True
 
 
 def plan_gradcheck(
@@ -154,7 +156,7 @@ def gradcheck(plan: GradcheckPlan, progress: Progress = silent) -> GradcheckRepo
         progress(min(next(done), total), total, what)
 
     begin("compiling")
-    layouts = [make_coordinates(task.scene, cell.contact) for cell in plan.cells]
+    layouts = [make_coordinates(task.scene, cell.contact, parameters=plan.parameters) for cell in plan.cells]
     programs = Programs(layouts[0], compiler)
     cases = [ContactCase(cell.contact, layout.scales) for cell, layout in zip(plan.cells, layouts, strict=True)]
     programs.start(cases[0], start_of(task.scene), stock=plan.stock)

@@ -112,7 +112,8 @@ class Coordinates:
         return apply_contact(model.replace(**geoms), contact)
 
 
-def make_coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
+def make_coordinates(scene: Scene, contact: ContactModel | None, *, parameters: bool = True) -> Coordinates:
+    """Lay out the inputs and outputs of a step, with the contact parameters or without."""
     host = scene.host
     dofs = [(name, joint) for joint in range(host.njnt) for name in _dof_names(host, joint)]
     actuators = [host.actuator(index).name or f"actuator {index}" for index in range(host.nu)]
@@ -122,7 +123,7 @@ def make_coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
     velocities = [Coordinate("qvel", *dof) for dof in dofs]
     acts = [Coordinate("act", name) for _, name in activations]
     lengths = [Coordinate(LENGTH, joint_name(host, joint), joint) for joint, *_ in quaternions(host)]
-    scales = _parameter_scales(scene, contact)
+    scales = _parameter_scales(scene, contact) if parameters else np.zeros(0)
     inputs = [*positions, *lengths, *velocities, *acts, *(Coordinate("ctrl", name) for name in actuators)]
     inputs += [Coordinate("contact", name) for name in PARAMETERS[: len(scales)]]
     return Coordinates(scene, tuple(inputs), (*positions, *velocities, *acts), scales)

@@ -10,7 +10,7 @@ import numpy as np
 from estimators.noise import split_sample_key
 from mjx_study.gradcheck.diagnosis import worst_verdict
 from mjx_study.gradcheck.differences import moves, take_differences
-from mjx_study.gradcheck.programs import Compiler
+from mjx_study.gradcheck.programs import Compiler, compiled
 from mjx_study.gradcheck.report import CostCheck, Entry, Finding
 from mjx_study.objective import rollout_cost
 from mjx_study.simulation.contact import ContactModel
@@ -36,6 +36,8 @@ class CostPrograms:
         self.task, self.compiler = task, compiler
         self.key = jax.random.key(seed)
         self.start = task.draw_start(split_sample_key(jax.random.clone(self.key))[0])
+        self._both_modes = compiled("derivatives of the cost", self._in_both_modes, task, seed)
+        self._many = compiled("costs", self._costs_at, task, seed)
 
     def compile(self, contact: ContactModel | None) -> None:
         """Start compiling the programs of the methods below."""
@@ -52,12 +54,12 @@ class CostPrograms:
         chunks = [self.compiler.run(self._many, part, contact) for part in parts]
         return np.concatenate(chunks)[: len(changes)]
 
-    def _both_modes(self, theta, contact, directions):
+    def _in_both_modes(self, theta, contact, directions):
         value, push, rollout = jax.linearize(lambda x: self._cost(x, contact), theta, has_aux=True)
         (gradient,) = jax.linear_transpose(push, theta)(jnp.ones_like(value))
         return rollout, gradient, jax.lax.map(push, directions)
 
-    def _many(self, thetas, contact):
+    def _costs_at(self, thetas, contact):
         return jax.vmap(lambda theta: self._cost(theta, contact)[0])(thetas)
 
     def _cost(self, theta, contact):

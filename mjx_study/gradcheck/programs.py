@@ -12,11 +12,12 @@ from typing import Any, Final, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.errors import JaxRuntimeError
 from jaxtyping import Array, Float
 
+from mjx_study.compiled import Compiled
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.values import STAGES
+from mjx_study.identity import code_of
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel
@@ -36,33 +37,29 @@ DIRECTIONS: Final = 96
 
 
 class Compiler:
-    """Programs by function and argument shapes, compiled fast, with little optimisation, in background threads."""
+    """Compiles programs fast, with little optimisation, in background threads."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="compile")
-        self._programs: dict[Any, Future[Callable[..., Any]]] = {}
+        self._running: list[tuple[Compiled, Future[None]]] = []
 
-    def start(self, function: Callable[..., Any], *arguments: Any) -> Future[Callable[..., Any]]:
-        """Trace the function for the shapes of the arguments, and compile it in the background."""
-        shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), str(jnp.result_type(leaf))), arguments)
-        key = (function, str(jax.tree.structure(arguments)), str(shapes))
-        if key not in self._programs:
-            lowered = jax.jit(function).lower(*arguments)
-            self._programs[key] = self._pool.submit(_compile, lowered)
-        return self._programs[key]
+    def start(self, program: Compiled, *arguments: Any) -> None:
+        """Trace the program for the shapes of the arguments, and compile it in the background."""
+        options = OPTIONS if jax.default_backend() == "cpu" else None
+        self._running.append((program, self._pool.submit(program.ahead(*arguments, options=options))))
 
-    def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
+    def run(self, program: Compiled, *arguments: Any) -> Any:
         with awaited():
-            return self.start(function, *arguments).result()(*arguments)
+            self.start(program, *arguments)
+            for _, future in [each for each in self._running if each[0] is program]:
+                future.result()
+            self._running = [each for each in self._running if each[0] is not program]
+            return program(*arguments)
 
 
-def _compile(lowered: Any) -> Callable[..., Any]:
-    if jax.default_backend() == "cpu":
-        try:
-            return lowered.compile(compiler_options=OPTIONS)
-        except JaxRuntimeError:  # an XLA version without these options
-            pass
-    return lowered.compile()
+def compiled(name: str, function: Callable[..., Any], *made_of: Any) -> Compiled:
+    """A program of a check, made of the code of checks and what else the function captures."""
+    return Compiled(function, name, *made_of, code_of(__name__))
 
 
 class ContactCase(NamedTuple):
@@ -111,6 +108,11 @@ class Programs:
         # Small scenes have a Jacobian over the state; derivatives of large ones, and over parameters, use the tape.
         inputs = len(layout.inputs)
         self._sizes = sorted({layout.num_state if layout.scene.uses_graph else inputs, inputs})
+        made_of = layout.scene, layout.inputs, layout.outputs
+        self._linear = compiled("derivatives of a step", self._derivatives_along, *made_of)
+        self._exact = compiled("converged steps", self._steps_after, *made_of)
+        self._stock = compiled("derivatives of mjx.step", self._stock_derivatives, *made_of)
+        self._stock_step = compiled("mjx.step", self._step_of_mjx, *made_of)
 
     def start(self, case: ContactCase, base: HostState, *, stock: bool) -> None:
         """Start compiling the programs of `linear`, `exact`, `stock_step` and, on request, `stock`."""
@@ -176,7 +178,7 @@ class Programs:
         tangent = difference_position(layout.scene.host, reference, after.qpos)
         return jnp.concatenate([tangent, after.qvel, after.act]), (after, *rest)
 
-    def _exact(self, point, reference, changes):
+    def _steps_after(self, point, reference, changes):
         def one(change):
             parameters = change[self.layout.num_state :]
             output, (after, _, data) = self._after(exact_step, point, change, parameters, reference)
@@ -185,7 +187,7 @@ class Programs:
 
         return jax.lax.map(one, changes)
 
-    def _linear(self, point, push_rows, pull_rows):
+    def _derivatives_along(self, point, push_rows, pull_rows):
         """Position after the step, residual, and derivatives along rows, forwards and backwards."""
         num_state, still, fixed = self.layout.num_state, jnp.zeros(len(self.layout.inputs)), None
         if push_rows.shape[1] < len(still):
@@ -198,14 +200,14 @@ class Programs:
         pull = jax.linear_transpose(push, still)
         return after.qpos, residual, jax.lax.map(push, push_rows), jax.lax.map(lambda row: pull(row)[0], pull_rows)
 
-    def _stock(self, point, push_rows):
+    def _stock_derivatives(self, point, push_rows):
         def output(change):
             return self._after(_mjx_step, point, change, change[self.layout.num_state :])[0]
 
         _, push = jax.linearize(output, jnp.zeros(len(self.layout.inputs)))
         return jax.lax.map(push, push_rows)
 
-    def _stock_step(self, point):
+    def _step_of_mjx(self, point):
         layout, ((contact, scales), state, control) = self.layout, point
         model = constraint.with_generous_budget(layout.model(contact, scales, jnp.zeros(len(layout.scales))))
         return _mjx_step(layout.scene, model, state, control)[0]

@@ -96,6 +96,11 @@ def known_libraries() -> list[str]:
     return list(_BUILT)
 
 
+def libraries_pending() -> int:
+    """Number of libraries that are being built."""
+    return sum(not each.done() for each in list(_BUILT.values()))
+
+
 def libraries_in(content: bytes) -> set[str]:
     """Names of the libraries that an exported program calls."""
     return {found.decode() for found in re.findall(rf"{PREFIX}[0-9a-f]{{40}}".encode(), content)}

@@ -14,9 +14,11 @@ from mjx_study.compiled import Compiled
 from mjx_study.tasks.task import Task
 from mjx_study.watchdog import awaited
 
-CPU_CHUNKS: Final = (5, 11, 21, 51, 101, 201)
-"""Samples per call on a CPU, which gains little from more. Few choices, so that other sample sizes reuse compiled
+CPU_CHUNKS: Final = (11, 101, 201)
+"""Samples per call on a CPU, which gains little from more. Few choices, so that other numbers of samples reuse compiled
 programs; one more than round numbers, for the baseline."""
+MANY: Final = 2000
+"""Samples from which a CPU takes the largest chunks, which pay for another program."""
 MAX_CHUNK: Final = {"cpu": CPU_CHUNKS[-1], "gpu": 2**17 + 1, "tpu": 2**17 + 1}
 """Maximum number of samples per device and call, by backend."""
 MAX_SHARE: Final = 0.25
@@ -49,7 +51,10 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
         return run(*placed[device], *jax.device_put(tuple(array[part] for array in rows), device))
 
     # Traced in this thread, since tracing patches MJX for the whole process.
-    run = program.prepare(*placed[devices[0]], *(array[chunks[0]] for array in rows), platform=devices[0].platform)
+    first = *placed[devices[0]], *(array[chunks[0]] for array in rows)
+    platform = devices[0].platform
+    alone = platform == jax.default_backend() == "cpu"
+    run = program.executable(*first) if alone else program.prepare(*first, platform=platform)
     left = iter(range(len(chunks)))
 
     def work(device: Any) -> None:
@@ -62,16 +67,19 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
     return jax.tree.map(lambda *leaves: join.concatenate(leaves)[:count], *outputs)
 
 
-def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = ()) -> int:
+def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), *, own_program: bool = False) -> int:
     """Choose the chunk size for `samples` and their baseline.
 
-    On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the largest. On accelerators, the size that needs the
-    fewest calls (at least one per device), evenly filled, with at most as many samples as task gradients fit into
-    `MAX_SHARE` of the memory.
+    On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the middle one for up to `MANY`; for a program of so many
+    samples alone, all that the largest holds. On accelerators, the size that needs the fewest calls (at least one per
+    device), evenly filled, with at most as many samples as task gradients fit into `MAX_SHARE` of the memory.
     """
     platform = devices[0].platform
     if platform == "cpu":
-        return min((size for size in CPU_CHUNKS if size > samples), default=CPU_CHUNKS[-1])
+        few, some, most = CPU_CHUNKS
+        if own_program:
+            return min(samples + 1, most)
+        return few if samples < few else some if samples < MANY else most
     each = math.ceil((samples + 1) / len(devices))
     memory = (devices[0].memory_stats() or {}).get("bytes_limit", math.inf)
     most = max(1, int(min(MAX_CHUNK[platform], MAX_SHARE * memory / max(map(_gradient_bytes, tasks), default=1))))

@@ -182,7 +182,12 @@ class StudyConfig:
         None, "CALL", "factor on sigma by iteration, an optax schedule", study="descents", unset="1"
     )
     reference_samples: int | None = declared(
-        None, "N", "pairs of rollouts for each reference", "[3, 1e7]", study="gradients", unset="600"
+        None,
+        "N",
+        "pairs of rollouts for each reference",
+        "[3, 1e7]",
+        study="gradients",
+        unset="600 or more, until its uncertainty is 5 %",
     )
     evaluation_samples: int | None = declared(
         None, "N", "rollouts for the cost of a final policy", "[2, 1e7]", study="descents", unset="200"

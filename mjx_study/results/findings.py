@@ -122,7 +122,7 @@ def _meaningless(rows: Sequence[Row], gammas: Bounds, label: Callable[[str], str
         found.append("nothing depends on K: the contact whose stiffness is swept was never active")
     if unsure := [row for row in rows if row.reference_uncertainty > MOST_UNCERTAINTY]:
         found.append(
-            f"the reference's own uncertainty exceeds {percent(MOST_UNCERTAINTY)}{_at(unsure)}: errors and verdicts "
+            f"the reference's own uncertainty exceeds {percent(MOST_UNCERTAINTY)}{_at(unsure)}: errors and shares "
             "mean little there; increase --reference-samples"
         )
     limited = [row for row in rows if row.epsilon is not None]
@@ -216,7 +216,9 @@ def _of(rows: Sequence[Row], seeds: int) -> str:
 
 
 def _share(rows: Sequence[Row]) -> str:
-    """Median debiased error as a share of the reference gradient, to significant digits only."""
+    """Median debiased error as a share of the reference gradient, to significant digits only, if that is known."""
+    if any(row.reference_uncertainty > MOST_UNCERTAINTY for row in rows):
+        return "an unknown share"
     share = float(np.median([row.debiased_error for row in rows]))
     error = max(max(row.debiased_error_se, row.reference_uncertainty) for row in rows)
     if not math.isfinite(share):

@@ -53,7 +53,9 @@ GRADIENTS: Final = {
     "norm_median": Variable(BATCH, "gradient", "median of the samples' norms"),
     "norm_90": Variable(BATCH, "gradient", "90 % quantile of the samples' norms"),
     "norm_max": Variable(BATCH, "gradient", "largest norm of a sample"),
-    "effective_samples": Variable(BATCH, "1", "effective number of samples behind the variance", "effective", 2),
+    "effective_samples": Variable(
+        BATCH, "1", "number of samples that carry the variance; with few, it means little", "effective", 2
+    ),
     "top_share": Variable(BATCH, "1", "share of the variance that the largest sample carries", "top"),
     "relative_error": Variable(BATCH, "1", "distance from mean to reference, over the latter's norm", "relative error"),
     "relative_error_se": Variable(BATCH, "1", "standard error of relative_error"),
@@ -67,7 +69,7 @@ GRADIENTS: Final = {
     "epsilon": Variable(BATCH, "gradient", "confidence radius of the zeroth-order mean", "epsilon"),
     "discrepancy": Variable(BATCH, "gradient", "distance between the two means", "B"),
     "bias_p_value": Variable(BATCH, "1", "p-value of no bias against the reference"),
-    "nonfinite": Variable(BATCH, "1", "nonfinite samples, left out", "nan", 0),
+    "nonfinite": Variable(BATCH, "1", "samples left out since cost or derivative is not finite", "nan", 0),
     "pooled_error": Variable(EACH, "1", "relative error of the mean over all seeds"),
     "squared_bias": Variable(EACH, "1", "squared bias over the reference's squared norm, unbiased", "squared bias"),
     "squared_bias_se": Variable(EACH, "1", "standard error of squared_bias"),
@@ -84,6 +86,7 @@ GRADIENTS: Final = {
     "reference_norm": Variable((), "gradient", "norm of the reference gradient"),
     "reference_uncertainty": Variable((), "1", "standard error of the reference, over its norm"),
     "reference_effective_samples": Variable((), "1", "effective number of samples behind the reference's variance"),
+    "reference_pairs": Variable((), "1", "pairs of rollouts behind the reference"),
     "gradient": Variable((*BATCH, "param"), "gradient", "mean gradient"),
     "reference": Variable(("param",), "gradient", "reference gradient"),
 }

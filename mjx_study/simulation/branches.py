@@ -22,12 +22,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Scalar
 from mjx_study.simulation.dynamics import Control, ControlLaw, Controls, State, force_stage, solved_step, step
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import SLOTS, least_travel, on_and_off
+from mjx_study.simulation.onset import SLOTS, guard_at, least_travel, on_and_off
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, find_events
 
@@ -67,8 +66,8 @@ def jump_term(
         _, last, total = jax.lax.while_loop(lambda carry: carry[0] < len(controls), advance, start)
         return total + final_cost(last)
 
-    guards = jax.vmap(lambda state, control: solved_step(scene, model, state, control)[-1])(before, controls)
-    events, missed = find_events(*guards, scene.timestep, slots)
+    course = jax.vmap(lambda state, control: solved_step(scene, model, state, control)[-1])(before, controls)
+    events, missed = find_events(course, scene.timestep, slots)
     filled = jnp.sum(events.used)
     weights = jnp.zeros((slots, 2, scene.host.nv), before.qpos.dtype)
     flags = jnp.zeros((slots, 2), bool)
@@ -98,12 +97,12 @@ def _weights(
     qpos, qvel = before.qpos[event.step], before.qvel[event.step]
     touch = at_touch(model, scene.template, qpos, qvel, event)
     start, positioned = integrate_position(host, qpos, -qvel, timestep * touch.share), touch.positioned
-    normals, members = (jnp.asarray(rows, qvel.dtype)[event.guard] for rows in constraint.guard_rows(model, positioned))
+    guard = guard_at(model, positioned, qvel, event)
 
     def jump(index):
         prepared = force_stage(model, positioned, before.qvel[index], before.act[index], controls[index])
         prepared = prepared.replace(qacc_warmstart=before.warmstart[index])
-        (after, act), qacc = on_and_off(model, prepared, members)
+        (after, act), qacc = on_and_off(model, prepared, guard)
 
         def go_on(qvel, act, qacc):
             return cost_to_go(index + 1, State(integrate_position(host, start, qvel, timestep), qvel, act, qacc))
@@ -113,8 +112,8 @@ def _weights(
 
     (here, previous), (qacc, _) = jax.vmap(jump)(jnp.stack([event.step, event.step - 1]))
     rows: Any = positioned._impl
-    normal = normals @ rows.efc_J
-    least = least_travel(model, positioned.replace(qvel=qvel), normals, qacc, event.ends)
+    normal = guard.weights @ rows.efc_J
+    least = least_travel(model, positioned.replace(qvel=qvel), guard, qacc, event.ends)
     cell, (last, earlier) = -jnp.maximum(jnp.abs(touch.travel), least), touch.weights
     weights = jnp.stack([last * here, earlier * previous])[:, None] * normal / cell
     return jnp.where(touch.valid, weights, 0.0), jnp.stack([touch.valid & (jnp.abs(touch.travel) < least), touch.valid])

@@ -11,7 +11,7 @@ the implicit function theorem: one symmetric positive definite system in `dG/da 
 its budget. The derivative is only as good as the solver's convergence, which `residual` measures and every result
 reports.
 
-MJX's constraint rows are private (`Data._impl.efc_*`) and are read only here.
+MJX's constraint rows are private (`Data._impl.efc_*`) and are read only here and in `guards`.
 """
 
 from collections.abc import Callable
@@ -23,20 +23,19 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mjx_study.graph.derivative_rule import with_rule
 from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
-from mjx_study.simulation.patches import AT_FIRST_TOUCH, RELAXING, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
 Scalar = Float[Array, ""]
 Qvel = Float[Array, " nv"]
 Rows = Float[Array, " rows"]
 Solver = Callable[[mjx.Model, mjx.Data], Qvel]
-_ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
+ELLIPTIC: Final = mujoco.mjtCone.mjCONE_ELLIPTIC
 
 OWN_SOLVER: Final = True
 """Whether small systems use the solver below instead of MJX's; tests compare both."""
@@ -74,7 +73,7 @@ def row_force(model: mjx.Model, data: mjx.Data, slack: Rows) -> Rows:
     kind[: rows.ne] = 2
     kind[rows.ne : rows.ne + rows.nf] = 1
     force = jnp.where(kind == 2, linear, jnp.where(kind == 1, friction, unilateral))
-    return _elliptic_force(model, rows, slack, linear, force) if model.opt.cone == _ELLIPTIC else force
+    return _elliptic_force(model, rows, slack, linear, force) if model.opt.cone == ELLIPTIC else force
 
 
 def _elliptic_force(model: mjx.Model, rows: Any, slack: Rows, linear: Rows, force: Rows) -> Rows:
@@ -131,7 +130,7 @@ def contact_forces(model: mjx.Model, data: mjx.Data) -> tuple[Int[Array, "contac
     rows: Any = data._impl
     contact, forces = rows.contact, []
     for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
-        edges = 2 * (condim - 1) if condim > 1 and model.opt.cone != _ELLIPTIC else 0
+        edges = 2 * (condim - 1) if condim > 1 and model.opt.cone != ELLIPTIC else 0
         force = rows.efc_force[int(address) : int(address) + (edges or int(condim))]
         if edges:
             plus, minus = force[::2], force[1::2]
@@ -308,63 +307,3 @@ def solve(model: mjx.Model, data: mjx.Data, solver: Solver = run_solver) -> Qvel
 
     root = with_rule(found, rule)
     return root(traced)
-
-
-def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
-    """Map each guard (limits first, then contacts) to its constraint rows; static, both `(guards, rows)`.
-
-    The weights combine rows into the guard's normal row (the mean of two opposite pyramid edges); the 0/1 mask tells
-    the rows that switch on with the guard.
-    """
-    rows: Any = data._impl
-    spans = [(rows.ne + rows.nf + index, 1, 1) for index in range(rows.nl)]
-    for condim, address in zip(rows.contact.dim, rows.contact.efc_address, strict=True):
-        pyramid = condim > 1 and model.opt.cone != _ELLIPTIC
-        spans.append((int(address), 2 if pyramid else 1, 2 * (int(condim) - 1) if pyramid else int(condim)))
-    weights, members = (np.zeros((len(spans), num_constraint_rows(data))) for _ in range(2))
-    for index, (first, normals, count) in enumerate(spans):
-        weights[index, first : first + normals] = 1 / normals
-        members[index, first : first + count] = 1.0
-    return weights, members
-
-
-def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-    """Distance minus margin [m or rad] and its rate [m/s or rad/s] of every active limit and contact; else zeros."""
-    weights, members = guard_rows(model, data)
-    rows: Any = data._impl
-    first = members.argmax(axis=1) if len(members) else np.zeros(0, int)
-    return (rows.efc_pos - rows.efc_margin)[first], jnp.asarray(weights, rows.efc_J.dtype) @ (rows.efc_J @ data.qvel)
-
-
-def guards_under_force(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Bool[Array, " guards"]:
-    _, members = guard_rows(model, data)
-    rows: Any = data._impl
-    force = jnp.abs(row_force(model, data, rows.efc_J @ qacc - rows.efc_aref))
-    return jnp.asarray(members, force.dtype) @ force > 0
-
-
-def at_onset(model: mjx.Model, data: mjx.Data, members: Rows, on: Bool[Array, ""]) -> mjx.Data:
-    """The state with the rows of `members` set to first touch (no penetration, impedance d_0) if `on`, else removed."""
-    with patched(AT_FIRST_TOUCH):
-        touching: Any = mjx.make_constraint(model, data)._impl
-    rows: Any = data._impl
-    chosen, acts = members > 0, jnp.where(on, 1.0, 0.0).astype(rows.efc_J.dtype)
-    keep = jnp.where(chosen, acts, 1.0)
-    changed: Any = data.tree_replace(
-        {
-            "_impl.efc_J": rows.efc_J * keep[:, None],
-            "_impl.efc_D": jnp.where(chosen, touching.efc_D, rows.efc_D),
-            "_impl.efc_aref": jnp.where(chosen, touching.efc_aref, rows.efc_aref) * keep,
-        }
-    )
-    return changed
-
-
-def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Rows) -> Scalar:
-    """max(b, sqrt(k d)) [1/s] of a guard with these weights at first touch: the rate at which contact slows it down.
-
-    The data are at the position stage, with a velocity at which the guard moves.
-    """
-    with patched(RELAXING):
-        rows: Any = mjx.make_constraint(model, data)._impl
-    return -(normal @ rows.efc_aref) / (normal @ (rows.efc_J @ data.qvel))

@@ -7,7 +7,7 @@ Both trace MJX's own pipeline with the patches of `patches`, and wrap MJX's own 
 import contextlib
 from collections.abc import Callable, Generator
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,21 +16,32 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import unknown
 from mjx_study.graph.derivative_rule import instantiated, with_rule
-from mjx_study.simulation import constraint
+from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qvel, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.native_step import solved_natively
 from mjx_study.simulation.onset import differentiated_once, onset_term, tangent_of, without_derivative
 from mjx_study.simulation.patches import Place, patched
-from mjx_study.simulation.touch import Events, onset_begins
+from mjx_study.simulation.touch import Events, crossings, onset_begins
 
 Replacements = dict[Place, Callable[..., mjx.Data]]
-Preceding = Bool[Array, "3 guards"]
 ONSETS: Final = ("none", "linear")
 """Treatments of the onset of contact in the derivatives of a step."""
-STEP_SLOTS: Final = 2
-"""Maximum number of contacts and limits with a term per step; others are left out."""
+
+
+class Preceding(NamedTuple):
+    """What the preceding step left of limits and contacts.
+
+    Attributes:
+        course: what their guards did in it.
+        existed: whether they existed in it; none does at time 0.
+        begun: whether they had just begun then.
+    """
+
+    course: guards.Course
+    existed: Bool[Array, " guards"]
+    begun: Bool[Array, " guards"]
 
 
 def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
@@ -148,29 +159,23 @@ _REPLACED: Final[dict[str, Replacements]] = {
 
 
 def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Preceding:
-    """Whether each contact or limit existed before the preceding step, had just begun then, and pushed during it.
+    """What the preceding step did, from the constraint rows that it left in its state.
 
-    From the constraint rows that the preceding step left in its state; none exists at time 0. After `mjx.forward` the
-    rows are those of the state itself, and no contact is seen to end. The velocity before that step, which tells
-    whether contact had just begun, is approximate where damping is integrated implicitly.
+    After `mjx.forward` the rows are those of the state itself, and no contact is seen to end. The velocity before that
+    step, which tells whether contact had just begun, is approximate where damping is integrated implicitly.
     """
     known = jax.lax.stop_gradient(data)
-    rows: Any = known._impl
-    before = known.replace(qvel=known.qvel - model.opt.timestep * known.qacc)
-    distance, speed = constraint.guards(model, before)
-    _, members = constraint.guard_rows(model, known)
-    existed = (distance < 0) & (known.time > 0)
-    begun = onset_begins(distance, model.opt.timestep * speed)
-    pushed = jnp.asarray(members, distance.dtype) @ jnp.abs(rows.efc_force) > 0
-    return jnp.stack([existed, existed & begun, existed & pushed])
+    before = known.qvel - model.opt.timestep * known.qacc
+    course = guards.course(model, known, before, known.qvel, known.qacc)
+    existed = (course.distance < 0) & (known.time > 0)
+    return Preceding(course, existed, existed & onset_begins(course.distance, model.opt.timestep * course.speed))
 
 
 def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Preceding) -> mjx.Data:
     """`mjx.step` with the same values, but derivatives that include the onset term.
 
-    Delta_k replaces Delta_{k-1}, which the state does not contain: an error of order h in the term. The first
-    `STEP_SLOTS` contacts and limits that begin or end in the step are corrected. None does at time 0, which no step
-    precedes.
+    Delta_k replaces Delta_{k-1}, which the state does not contain: an error of order h in the term. No
+    contact begins or ends at time 0, which no step precedes.
     """
     model, timestep = without_derivative(model), model.opt.timestep
     fixed = jax.lax.stop_gradient(data)
@@ -205,25 +210,25 @@ def _step_terms(
 ) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"]]:
     """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins or ends."""
     positioned = fwd_position(model, data)
-    distance, speed = constraint.guards(model, positioned)
-    none = jnp.zeros((2, model.nv, model.nv), data.qvel.dtype)
-    if not distance.size:
-        return none[0], none[1]
-    existed, begun, pushed = preceding
-    ends = pushed & (distance >= 0)
-    begins = (onset_begins(distance, model.opt.timestep * speed) | ((distance < 0) & ~existed)) & (data.time > 0)
+    here = guards.course(model, positioned, data.qvel, data.qvel, data.qacc)
+    empty = jnp.zeros((model.nv, model.nv), data.qvel.dtype)
+    if not here.distance.size:
+        return empty, empty
+    existed, active = preceding.existed, here.distance < 0
+    crossing = crossings(here, preceding.course, model.opt.timestep)
+    ends = existed & preceding.course.pushes & (~active | crossing.ends)
+    begins = crossing.begins | (active & ~existed)
+    states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
 
-    def terms():
-        (chosen,) = jnp.nonzero(begins | ends, size=min(STEP_SLOTS, distance.size), fill_value=distance.size)
-        states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
+    def add(carry):
+        left, *sums = carry
+        guard = jnp.argmax(left)
+        brief, others = ends[guard] & preceding.begun[guard], crossing.others(guard)
+        event = Events(jnp.zeros((), int), guard, ends[guard], brief, *others, jnp.array(True))
+        parts = onset_term(model, data, states, data.ctrl[None], event)[:2]
+        return left.at[guard].set(False), *(total + part for total, part in zip(sums, parts, strict=True))
 
-        def term(guard):
-            event = Events(jnp.zeros((), int), guard, ends[guard], ends[guard] & begun[guard], jnp.array(True))
-            return onset_term(model, data, states, data.ctrl[None], event)
-
-        here, previous, *_ = jax.vmap(term)(jnp.minimum(chosen, distance.size - 1))
-        used = (chosen < distance.size)[:, None, None]
-        return jnp.stack([jnp.sum(jnp.where(used, part, 0.0), axis=0) for part in (here, previous)])
-
-    here, previous = jax.lax.cond(jnp.any(begins | ends), terms, lambda: none)
+    # the loop over a batch ends with the last event of any sample
+    left = (begins | ends) & (data.time > 0)
+    _, here, previous = jax.lax.while_loop(lambda carry: jnp.any(carry[0]), add, (left, empty, empty))
     return here, previous

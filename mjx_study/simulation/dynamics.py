@@ -30,7 +30,7 @@ import mujoco
 import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from estimators.pytree import register_pytree
 from mjx_study.graph.derivative_rule import instantiated, with_rule
@@ -39,7 +39,7 @@ from mjx_study.graph.linear_map import implicit_derivative, implicit_jacobian
 from mjx_study.graph.native import count_left, native_identity
 from mjx_study.graph.operation import applied, computed
 from mjx_study.graph.scalars import captured_once, is_small, traced_part, unrolled
-from mjx_study.simulation import constraint
+from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
 from mjx_study.simulation.integration import integrate_position
@@ -132,17 +132,14 @@ def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Control
     return force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
 
 
-def solved_step(
-    scene: Scene, model: mjx.Model, state: State, control: Control
-) -> tuple[State, Scalar, tuple[Float[Array, " guards"], Float[Array, " guards"], Bool[Array, " guards"]]]:
-    """`step` without derivatives; the `constraint.guards` before the step, and which of them exert a force in it."""
+def solved_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, guards.Course]:
+    """`step` without derivatives, and the course of the guards in it."""
     return _with_solver(partial(_solved_step, scene), model, state, control)
 
 
 def _solved_step(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Array):
     after, residual, data = _solved(solver, scene, model, state, control)
-    guards = *constraint.guards(model, data), constraint.guards_under_force(model, data, after.warmstart)
-    return after, residual, guards
+    return after, residual, guards.course(model, data, state.qvel, after.qvel, after.warmstart)
 
 
 def _solved(solver: constraint.Solver, scene: Scene, model: mjx.Model, state: State, control: Array):

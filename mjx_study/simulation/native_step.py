@@ -31,10 +31,11 @@ Layout = tuple[Any, tuple[jax.ShapeDtypeStruct, ...], tuple[int, ...]]
 def solved_natively(model: mjx.Model, data: mjx.Data) -> Step | None:
     """A step in native code, of first and higher derivatives over every array of `data` but the warm start.
 
-    None if there is no native code, or the model is traced, has RK4, a budget below `AMPLE` or too large a step.
+    None without native code, and if the model is traced, has no coordinate, RK4, a budget below `AMPLE` or too large a
+    step.
     """
     explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    if native_identity() is None or explicit or model.opt.iterations < AMPLE:
+    if native_identity() is None or explicit or model.opt.iterations < AMPLE or not model.nv:
         return None
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(model)):
         return None

@@ -30,7 +30,7 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 (arXiv 2306.06862), for the continuous-time limit.
 """
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,9 +39,9 @@ from jaxtyping import Array, Bool, Float
 from mjx_study.choices import ONSETS, unknown
 from mjx_study.graph.derivative_rule import refusing, with_rule
 from mjx_study.graph.scalars import traced_part
-from mjx_study.simulation import constraint
+from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.constraint import Rows, Scalar
+from mjx_study.simulation.constraint import Qvel, Rows, Scalar
 from mjx_study.simulation.dynamics import (
     ControlLaw,
     Controls,
@@ -54,6 +54,7 @@ from mjx_study.simulation.dynamics import (
     step_change,
     trajectory,
 )
+from mjx_study.simulation.guards import Course
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.linear_algebra import product
 from mjx_study.simulation.scene import Scene
@@ -101,11 +102,11 @@ def corrected_rollout(
 
     def observe(state: State, given: Any):
         control = jax.lax.stop_gradient(control_law(given, state))
-        following, residual, guards = solved_step(scene, model, state, control)
-        return following, (state, control, following, residual, guards)
+        following, residual, course = solved_step(scene, model, state, control)
+        return following, (state, control, following, residual, course)
 
-    _, (before, controls, after, residuals, guards) = jax.lax.scan(observe, jax.lax.stop_gradient(start), inputs)
-    spread, shift, counts = _corrections(scene, model, before, controls, guards, slots)
+    _, (before, controls, after, residuals, course) = jax.lax.scan(observe, jax.lax.stop_gradient(start), inputs)
+    spread, shift, counts = _corrections(scene, model, before, controls, course, slots)
     spread, shift = weight * spread, weight * shift
 
     def follow(change: State, known):
@@ -133,10 +134,10 @@ def corrected_rollout(
 
 
 def _corrections(
-    scene: Scene, model: mjx.Model, before: State, controls: Controls, guards: tuple[Array, Array, Array], slots: int
+    scene: Scene, model: mjx.Model, before: State, controls: Controls, course: Course, slots: int
 ) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
     """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero without events, and counts."""
-    events, missed = find_events(*guards, scene.timestep, slots)
+    events, missed = find_events(course, scene.timestep, slots)
 
     def term(event: Events):
         pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
@@ -151,7 +152,7 @@ def _corrections(
 
     # Most rollouts have fewer events than slots; an accelerator computes all slots in the time of one.
     together = 1 if jax.default_backend() == "cpu" else slots
-    filled, (size, dtype) = jnp.sum(events.used), (scene.host.nv, guards[0].dtype)
+    filled, (size, dtype) = jnp.sum(events.used), (scene.host.nv, course.distance.dtype)
     matrix, flag = jnp.zeros((slots, size, size), dtype), jnp.zeros(slots, bool)
     terms = matrix, matrix, jnp.zeros(slots, dtype), flag, flag
     if slots:
@@ -178,18 +179,16 @@ def onset_term(
     touch = at_touch(model, template, states.qpos[0], states.qvel[0], event)
     positioned = touch.positioned
     rows: Any = positioned._impl
-    weights, members = (
-        jnp.asarray(each, rows.efc_J.dtype)[event.guard] for each in constraint.guard_rows(model, positioned)
-    )
+    guard = guard_at(model, positioned, states.qvel[0], event)
 
     def jump(qvel, act, control, warmstart):
         forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
-        (after, _), qacc = on_and_off(model, forced, members)
+        (after, _), qacc = on_and_off(model, forced, guard)
         return after[0] - after[1], qacc
 
     jumps, qacc = jax.vmap(jump)(states.qvel, states.act, controls, states.warmstart)
-    least = least_travel(model, positioned.replace(qvel=states.qvel[0]), weights, qacc[0], event.ends)
-    normal = weights @ rows.efc_J
+    least = least_travel(model, positioned.replace(qvel=states.qvel[0]), guard, qacc[0], event.ends)
+    normal = guard.weights @ rows.efc_J
     cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
     last, before = touch.weights
     here, previous = (jnp.outer(jump, normal) / cell for jump in (last * jumps[0], before * jumps[-1]))
@@ -198,33 +197,61 @@ def onset_term(
     return here, previous, strength, valid & (jnp.abs(touch.travel) < least), valid
 
 
+class GuardAtTouch(NamedTuple):
+    """A guard that passes zero.
+
+    Attributes:
+        weights, deep: as in `guards.Guards`.
+        members: the rows that begin or end with it.
+        absent: rows of the event's `absent` guards.
+        touching: rows without penetration.
+    """
+
+    weights: Rows
+    deep: Bool[Array, ""]
+    members: Rows
+    absent: Rows
+    touching: Rows
+
+
+def guard_at(model: mjx.Model, positioned: mjx.Data, qvel: Qvel, event: Events) -> GuardAtTouch:
+    """The guard of an event, at the position stage of its touch and the velocity with which it moves there."""
+    found = guards.find_guards(model, positioned, qvel, event.ends)
+    _, members = guards.guard_rows(model, positioned)
+    members = jnp.asarray(members, found.weights.dtype)
+    absent, touching = (each.astype(members.dtype) @ members for each in (event.absent, event.touching & ~found.deep))
+    weights, deep = found.weights[event.guard], found.deep[event.guard]
+    return GuardAtTouch(weights, deep, members[event.guard], absent, touching)
+
+
 def least_travel(
-    model: mjx.Model, data: mjx.Data, normal: Rows, qacc: Float[Array, "2 nv"], ends: Bool[Array, ""]
+    model: mjx.Model, data: mjx.Data, guard: GuardAtTouch, qacc: Float[Array, "2 nv"], ends: Bool[Array, ""]
 ) -> Scalar:
     """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
 
-    Arguments as for `constraint.relaxation_rate`; the acceleration with and without the contact; whether contact ends.
+    Arguments as for `guards.relaxation_rate`; the acceleration with and without the contact; whether contact ends.
     """
     rows: Any = data._impl
-    on, off = jnp.abs((qacc @ rows.efc_J.T) @ normal)
-    fastest = jnp.where(ends, jnp.maximum(on, off), off)
-    return model.opt.timestep * fastest / constraint.relaxation_rate(model, data, normal)
+    on, off = jnp.abs((qacc @ rows.efc_J.T) @ guard.weights)
+    fastest = jnp.where(ends | guard.deep, jnp.maximum(on, off), off)
+    return model.opt.timestep * fastest / guards.relaxation_rate(model, data, guard.weights)
 
 
 def on_and_off(
-    model: mjx.Model, data: mjx.Data, members: Rows
+    model: mjx.Model, data: mjx.Data, guard: GuardAtTouch
 ) -> tuple[tuple[Float[Array, "2 nv"], Float[Array, "2 na"]], Float[Array, "2 nv"]]:
-    """Velocities and activations after a step, and its accelerations, with the rows of `members` on or off.
+    """Velocities and activations after a step, and its accelerations, with the rows of a guard on or off.
 
-    See `constraint.at_onset`; the data are those of `force_stage`, with the solver's warm start.
+    The data are those of `force_stage`, with the solver's warm start.
     """
+    touching = guards.at_first_touch(model, data, guard.touching)
 
-    def advanced(on):
-        prepared = constraint.at_onset(model, data, members, on)
+    def advanced(off):
+        prepared = guards.without(touching, guard.absent + off * guard.members)
         qacc = constraint.run_solver(model, prepared)
         return advance_velocity(model, prepared, qacc), qacc
 
-    return jax.vmap(advanced)(jnp.array([True, False]))
+    return jax.vmap(advanced)(jnp.array([0.0, 1.0], guard.members.dtype))
 
 
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from estimators.pytree import register_pytree
-from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qpos, Qvel, Scalar, fwd_position
+from mjx_study.simulation.guards import Course, motion
 from mjx_study.simulation.integration import integrate_position
 
 TOUCHING_SHARE: Final = 1e-6
@@ -56,9 +56,11 @@ class Events:
     """Steps at which a contact or limit begins, or ends while it exerts a force, earliest first.
 
     Attributes:
-        step, guard: index of the step and of the contact or limit, as in `constraint.guard_rows`.
+        step, guard: index of the step and of the contact or limit, as in `guards.guard_rows`.
         ends: whether it ends at that step; otherwise it begins.
         brief: whether the gap before it, or the contact that ends, lasted one step.
+        absent: guards that begin later in the step, or have ended earlier in it.
+        touching: guards that pass zero at the same time or almost, including this one.
         used: whether the slot holds an event; others hold step 1, guard 0.
     """
 
@@ -66,6 +68,8 @@ class Events:
     guard: Int[Array, "*slots"]
     ends: Bool[Array, "*slots"]
     brief: Bool[Array, "*slots"]
+    absent: Bool[Array, "*slots guards"]
+    touching: Bool[Array, "*slots guards"]
     used: Bool[Array, "*slots"]
 
     def counts(
@@ -80,30 +84,67 @@ class Events:
         return OnsetCounts(onsets + missed, jnp.sum(narrow), missed, strength, first)
 
 
-def find_events(
-    distance: Float[Array, "horizon guards"],
-    speed: Float[Array, "horizon guards"],
-    under_force: Bool[Array, "horizon guards"],
-    timestep: float | Float[Array, ""],
-    slots: int,
-) -> tuple[Events, Int[Array, ""]]:
+def find_events(course: Course, timestep: float | Scalar, slots: int) -> tuple[Events, Int[Array, ""]]:
     """Find where contacts and limits may begin, or end under force (`at_touch` says whether they do); count the rest.
 
     Args:
-        distance, speed: `constraint.guards` before each step.
-        under_force: whether each guard exerts a force in each step.
+        course: what the guards do in each step.
         slots: maximum number of events to return.
     """
-    active = distance < 0
+    active = course.distance < 0
     before = jnp.roll(active, 1, axis=0)
-    begins = onset_begins(distance, timestep * speed) | (active & ~before)
-    ends = before & ~active & jnp.roll(under_force, 1, axis=0)
+    crossing = crossings(course, jax.tree.map(lambda leaf: jnp.roll(leaf, 1, axis=0), course), timestep)
+    begins = crossing.begins | (active & ~before)
+    ends = before & jnp.roll(course.pushes, 1, axis=0) & (~active | crossing.ends)
     brief = ends ^ jnp.roll(active, 2, axis=0).at[:2].set(False)
     happens = (begins | ends).at[0].set(False)
     (flat,) = jnp.nonzero(happens.reshape(-1), size=slots, fill_value=happens.size)
     used = flat < happens.size
     step, guard = jnp.divmod(jnp.where(used, flat, happens.shape[1]), happens.shape[1])
-    return Events(step, guard, ends[step, guard], brief[step, guard], used), jnp.sum(happens) - jnp.sum(used)
+    at_step = jax.tree.map(lambda leaf: leaf[step], crossing)
+    absent, touching = jax.vmap(Crossings.others)(at_step, guard)
+    events = Events(step, guard, ends[step, guard], brief[step, guard], absent, touching, used)
+    return events, jnp.sum(happens) - jnp.sum(used)
+
+
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class Crossings:
+    """Guards that pass zero between two steps, along straight lines.
+
+    Attributes:
+        begins, ends: whether the guard becomes negative, or ceases to be.
+        since: share of a step since then.
+    """
+
+    begins: Bool[Array, "*steps guards"]
+    ends: Bool[Array, "*steps guards"]
+    since: Float[Array, "*steps guards"]
+
+    def others(self, guard: Int[Array, ""]) -> tuple[Bool[Array, " guards"], Bool[Array, " guards"]]:
+        """Guards that are absent when one passes zero, and those that pass zero with it; see `Events`.
+
+        In a tie guards take turns by index. Any order that the guards of a step share makes their jumps add up to that
+        of all of them together.
+        """
+        index, own = jnp.arange(len(self.since)), self.since[guard]
+        earlier = (self.since > own) | ((self.since == own) & (index < guard))
+        absent = ((self.begins & ~earlier) | (self.ends & earlier)) & (index != guard)
+        return absent, (self.begins | self.ends) & (jnp.abs(self.since - own) < NEAR_TOUCH) | (index == guard)
+
+
+def crossings(here: Course, preceding: Course, timestep: float | Scalar) -> Crossings:
+    """Crossings between a step and the one that precedes it.
+
+    A slot of MJX that changes to another corner of its geom may have one that ends and one that begins, if it does.
+    """
+    travel, leaves = timestep * here.speed, timestep * preceding.leaving
+    begins = onset_begins(here.distance, travel)
+    ends = (preceding.room < 0) & (leaves > 0) & (preceding.room + leaves >= 0)
+    carried_on = jnp.abs(here.distance - travel - preceding.room) < jnp.abs(leaves) / 2
+    ends = ends & ~((here.distance < 0) & carried_on)
+    begun = here.distance / jnp.where(begins, travel, 1.0)
+    return Crossings(begins, ends, jnp.where(begins, begun, 1 + preceding.room / jnp.where(ends, leaves, 1.0)))
 
 
 def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "*steps guards"]) -> Bool[Array, "..."]:
@@ -144,7 +185,7 @@ def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event
 
     def stage(back):
         data = fwd_position(model, template.replace(qpos=integrate_position(model, qpos, qvel, -timestep * back)))
-        distance, speed = constraint.guards(model, data.replace(qvel=qvel))
+        distance, speed = motion(model, data, qvel, ends)
         return (distance[guard], timestep * speed[guard]), data
 
     def since(distance: Array, travel: Array, curvature: Array) -> tuple[Array, Array]:
@@ -153,14 +194,18 @@ def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event
         return -2 * distance / jnp.maximum(speed - travel, tiny), -speed
 
     zero, tiny = jnp.zeros_like(qpos, shape=()), jnp.finfo(qpos.dtype).tiny
-    (distance, travel), (_, curvature), deep = jax.jvp(stage, (zero,), (-jnp.ones_like(zero),), has_aux=True)
+    inside = jnp.where(ends, 1.0, zero)
+    known, (_, curvature), deep = jax.jvp(stage, (inside,), (-jnp.ones_like(zero),), has_aux=True)
+    distance, travel = known
     begun, _ = since(distance, travel, curvature)
-    back = jnp.where(ends, 1.0, (1 - NEAR_TOUCH) * jnp.minimum(begun, 1.0))
-    at_back, near = stage(back)
+    away = jnp.where(ends, jnp.maximum(distance / jnp.where(travel == 0, 1.0, travel), -1.0), jnp.minimum(begun, 1.0))
+    away = (1 - NEAR_TOUCH) * away
+    at_back, near = stage(inside + away)
     # MJX may report no contact close to the touch, or another one in its place.
-    chosen = ends | (at_back[0] < 0)
+    unexpected = jnp.abs(at_back[0] - (distance - travel * away + curvature * away**2 / 2))
+    chosen = (at_back[0] < 0) & (unexpected < jnp.abs(distance) / 2)
     choose = lambda one, other: jax.tree.map(partial(jnp.where, chosen), one, other)  # noqa: E731
-    (distance, travel), positioned, back = choose((at_back, near, back), ((distance, travel), deep, zero))
+    (distance, travel), positioned, back = choose((at_back, near, inside + away), (known, deep, inside))
     more, closing = since(distance, travel, curvature)
     share = back + jnp.where(ends, distance / jnp.where(travel == 0, 1.0, travel), more)
     travel = jnp.where(ends, travel, closing)

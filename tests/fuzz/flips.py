@@ -99,6 +99,6 @@ def _of_caches(root: Path, draw: random.Random) -> Iterator[tuple[Path, Callable
         programs.put("program", draw.randbytes(draw.choice([0, 1, 64, 65, 5000])))
         read: dict[Path, Callable[[Path], Any]] = {
             root / "programs" / "program-cache": lambda _: programs.get("program"),
-            trace: compiled._read,
+            trace: lambda path: compiled._read(path, "sine"),
         }
         yield from ((path, lambda path=path, each=each: check(path, each)) for path, each in read.items())

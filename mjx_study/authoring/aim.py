@@ -1,0 +1,107 @@
+"""What a task asks of a model: which body should be where, at the end of a rollout.
+
+The body is one that noise moves: the load that a driven model pushes, else the trunk of one that walks, else the tip of
+its longest chain. The goal is as far from where it ends by itself as held controls typically take it.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import mujoco
+import numpy as np
+
+from mjx_study.authoring.trial import Drive, Trial
+
+MOVED: Final = 1e-6
+"""Spread of an end that counts as moved by noise [m or rad]."""
+TYPICAL: Final = 1.5
+"""Standard deviation of normal numbers in median absolute deviations; a single fall or throw does not count."""
+LEAST: Final = 0.02
+"""Least distance of a goal, in extents of the model."""
+FORWARD: Final = 0.3
+"""Share of the greatest spread along an axis from which on the x axis is preferred."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Aim:
+    """Where something should end.
+
+    Attributes:
+        body: index of the body whose centre of mass is to move; None for a coordinate of qpos.
+        role: what the body is.
+        axis: axis of the world (0 to 2), or index in qpos.
+        end: where it ends by itself [m, or unit of qpos]; all three axes for a body.
+        distance: how far the goal is from there along the axis.
+    """
+
+    body: int | None
+    role: str
+    axis: int
+    end: tuple[float, ...]
+    distance: float
+
+    @property
+    def goal(self) -> tuple[float, ...]:
+        """Three coordinates of a body, or one of qpos."""
+        moved = self.axis if self.body is not None else 0
+        return tuple(rounded(value + self.distance * (place == moved)) for place, value in enumerate(self.end))
+
+    def misses(self, trial: Trial, steps: int) -> float:
+        """Squared distance from the goal, in units of the distance."""
+        ends = trial.qpos[steps, [self.axis]] if self.body is None else trial.centres[steps, self.body]
+        return float(np.sum((ends - np.array(self.goal)) ** 2)) / self.distance**2
+
+
+def rounded(value: float, digits: int = 3) -> float:
+    """A value with so many significant digits."""
+    return float(f"{value:.{digits}g}")
+
+
+def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequence[Trial], steps: int) -> Aim | None:
+    """The first of the candidates that noise moves; None if it moves nothing.
+
+    Args:
+        quiet: rollout without noise.
+        noisy: rollouts with the policy's noise.
+        held: rollouts with large constant changes.
+        steps: steps after which the end is measured.
+    """
+    for body, role in _candidates(drive):
+        ends, far = (np.array([each.centres[steps, body] for each in trials]) for trials in (noisy, held))
+        spread = TYPICAL * np.median(np.abs(far - np.median(far, axis=0)), axis=0)
+        if np.std(ends, axis=0).max() > MOVED:
+            axis = 0 if spread[0] >= FORWARD * spread.max() else int(np.argmax(spread))
+            end = tuple(quiet.centres[steps, body].tolist())
+            return Aim(body, role, axis, end, rounded(max(spread[axis], LEAST * drive.host.stat.extent), 1))
+    ends, far = (np.array([each.qpos[steps] for each in trials]) for trials in (noisy, held))
+    axis = int(np.argmax(np.std(ends, axis=0)))
+    if min(np.std(ends[:, axis]), np.std(far[:, axis])) <= MOVED:
+        return None
+    return Aim(None, "coordinate", axis, (float(quiet.qpos[steps, axis]),), rounded(float(np.std(far[:, axis])), 1))
+
+
+def _candidates(drive: Drive) -> Iterator[tuple[int, str]]:
+    """Bodies that a task may be about, the best first."""
+    host, driven = drive.host, _driven(drive.host)
+    dofs = {root: np.flatnonzero(host.body_rootid[host.dof_bodyid] == root) for root in set(host.body_rootid[1:])}
+    moving = sorted(int(root) for root, own in dofs.items() if len(own))
+    if not drive.at_start:
+        yield from ((root, "load") for root in moving if not driven[dofs[root]].any())
+    for root in moving:
+        own = np.flatnonzero(host.dof_bodyid == root)
+        if len(own) and not driven[own].any():
+            yield root, "body" if drive.at_start else "trunk"
+    depth = np.zeros(host.nbody, int)
+    for body in range(1, host.nbody):
+        depth[body] = depth[host.body_parentid[body]] + 1
+    yield from ((int(body), "tip") for body in np.argsort(-depth, kind="stable") if host.body_rootid[body] in moving)
+
+
+def _driven(host: mujoco.MjModel) -> np.ndarray:
+    """Whether an actuator acts on each degree of freedom."""
+    data = mujoco.MjData(host)
+    mujoco.mj_forward(host, data)
+    moments = np.zeros((host.nu, host.nv))
+    mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    return (moments != 0).any(axis=0)

@@ -1,0 +1,131 @@
+"""Test rollouts of a model in MuJoCo's C engine: where its bodies go, and what they touch."""
+
+import copy
+import dataclasses
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from mjx_study.simulation.engine import quiet_engine
+
+SECONDS: Final = 2.0
+"""Longest test rollout [s]."""
+MOST_TRIED: Final = 2000
+"""Maximum number of steps of a test rollout."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Drive:
+    """What a policy acts by: controls, or increments of the initial velocity if there are no actuators.
+
+    Attributes:
+        host: the compiled model.
+        neutral: controls without a policy, (nu,).
+        scale: standard deviation of the noise, in the unit of what it is added to.
+        meaning: what the scale is, in words.
+    """
+
+    host: mujoco.MjModel
+    neutral: Float[np.ndarray, " nu"]
+    scale: float
+    meaning: str
+
+    @property
+    def size(self) -> int:
+        """Number of entries: controls of a step, or initial velocities."""
+        return self.host.nu or self.host.nv
+
+    @property
+    def at_start(self) -> bool:
+        """Whether it acts on the initial velocity."""
+        return self.host.nu == 0
+
+
+@dataclasses.dataclass
+class Touch:
+    """A pair of geoms in contact during a rollout.
+
+    Attributes:
+        first: step of the first touch.
+        speed: approach speed then [m/s].
+        depth: greatest penetration [m].
+        steps: number of steps in contact.
+    """
+
+    first: int
+    speed: float
+    depth: float = 0.0
+    steps: int = 0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trial:
+    """One test rollout.
+
+    Attributes:
+        centres: centres of mass of all bodies after each step [m], (steps + 1, nbody, 3).
+        qpos: positions, (steps + 1, nq).
+        touches: contacts, by pairs of geoms.
+        limits: joints that reached a limit.
+    """
+
+    centres: Float[np.ndarray, "states nbody 3"]
+    qpos: Float[np.ndarray, "states nq"]
+    touches: dict[tuple[int, int], Touch]
+    limits: frozenset[int]
+
+    @property
+    def steps(self) -> int:
+        """Number of steps until a state was not finite."""
+        return len(self.qpos) - 1
+
+
+def start_of(host: mujoco.MjModel) -> mujoco.MjData:
+    """The first keyframe at time 0, or else the reference pose at rest."""
+    data = mujoco.MjData(host)
+    if host.nkey:
+        data.qpos[:], data.qvel[:] = host.key_qpos[0], host.key_qvel[0]
+    mujoco.mj_forward(host, data)
+    return data
+
+
+def run_trial(drive: Drive, change: Float[np.ndarray, "rows size"], steps: int) -> Trial:
+    """Roll out with a change of the neutral controls in every step, or of the initial velocity (one row)."""
+    host = copy.copy(drive.host)
+    host.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    data = start_of(host)
+    if drive.at_start:
+        data.qvel += change[0]
+    mujoco.mj_forward(host, data)
+    centres, qpos, touches, limits = [data.xipos.copy()], [data.qpos.copy()], {}, set()
+    with quiet_engine():
+        for step in range(steps):
+            data.ctrl[:] = drive.neutral if drive.at_start else drive.neutral + change[step % len(change)]
+            mujoco.mj_step(host, data)
+            _note(host, data, step, touches, limits)
+            mujoco.mj_kinematics(host, data)
+            if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
+                break
+            centres.append(data.xipos.copy())
+            qpos.append(data.qpos.copy())
+    return Trial(np.array(centres), np.array(qpos), touches, frozenset(limits))
+
+
+def _note(
+    host: mujoco.MjModel, data: mujoco.MjData, step: int, touches: dict[tuple[int, int], Touch], limits: set[int]
+) -> None:
+    """Add the contacts and limits of a step."""
+    elliptic, contacts = host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, data.contact
+    rows = zip(contacts.geom, contacts.dist, contacts.dim, contacts.efc_address, strict=True)
+    for geoms, distance, condim, address in rows:
+        if address < 0:
+            continue
+        approach = -float(np.mean(data.efc_vel[address : address + (1 if elliptic or condim == 1 else 2)]))
+        first, second = sorted(geoms.tolist())
+        touch = touches.setdefault((first, second), Touch(step, approach))
+        touch.depth = max(touch.depth, -float(distance))
+        touch.steps += 1
+    limited = data.efc_type[: data.nefc] == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
+    limits.update(data.efc_id[: data.nefc][limited].tolist())

@@ -1,0 +1,269 @@
+"""`mjx-study init`: a file for any model, which every command runs as it is, or a reason in one line."""
+
+import dataclasses
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_study import cli, initial_state, load_scene
+from mjx_study.authoring import proposal
+from mjx_study.authoring.proposal import Proposal, propose
+from mjx_study.authoring.task_file import function_name, source_of_task
+from mjx_study.simulation.contact import effective_mass
+from mjx_study.simulation.scene import put_scene
+from mjx_study.tasks.soundness import check_soundness
+from mjx_study.tasks.task import Task, check_shapes
+
+ROOT = Path(__file__).parents[1]
+FLOOR: Final = '<option timestep="0.004"/><worldbody><geom name="floor" type="plane" size="3 3 .1"/>'
+ARM: Final = """
+<mujoco model="arm"><option timestep="0.004" cone="elliptic"/><worldbody>
+  <geom name="floor" type="plane" size="5 1 0.1" friction="0.6"/>
+  <body name="upper" pos="0 0 0.6"><joint name="shoulder" axis="0 1 0" damping="0.1"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.5" contype="0" conaffinity="0"/>
+    <body name="lower" pos="0.3 0 0"><joint name="elbow" axis="0 1 0" damping="0.1"/>
+      <geom name="hand" type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.3" contype="2" conaffinity="2"/>
+    </body></body>
+  <body name="ball" pos="0.35 0 0.05"><joint name="x" type="slide" axis="1 0 0"/>
+    <geom name="ball" size="0.2" mass="0.5" contype="2" conaffinity="2"/></body></worldbody>
+  <actuator><motor joint="shoulder" gear="5"/><motor name="elbow" joint="elbow" gear="3"/></actuator></mujoco>"""
+LEG: Final = """
+<mujoco model="leg"><option timestep="0.004" cone="elliptic"/><worldbody>
+  <geom name="floor" type="plane" size="5 1 0.1" friction="0.8"/>
+  <body name="torso" pos="0 0 0.56"><joint name="x" type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+    <geom type="box" size="0.1 0.08 0.06" mass="3" contype="0" conaffinity="0"/>
+    <body name="thigh"><joint name="hip" axis="0 -1 0" damping="0.3"/>
+      <geom type="capsule" fromto="0 0 0 0.1 0 -0.22" size="0.03" mass="0.5" contype="0" conaffinity="0"/>
+      <body name="shin" pos="0.1 0 -0.22"><joint name="knee" axis="0 -1 0" damping="0.3"/>
+        <geom type="capsule" fromto="0 0 0 -0.1 0 -0.22" size="0.02" mass="0.2" contype="0" conaffinity="0"/>
+        <geom name="foot" pos="-0.1 0 -0.24" size="0.04" mass="0.1" friction="0.8"/></body></body></body></worldbody>
+  <actuator><position name="hip" joint="hip" kp="60" kv="2" ctrlrange="-1 1"/>
+    <position name="knee" joint="knee" kp="60" kv="2" ctrlrange="-1 1"/></actuator>
+  <keyframe><key qpos="0 0 0.1 0" qvel="0.5 0 0 0" ctrl="0.1 0"/></keyframe></mujoco>"""
+BALL: Final = (
+    f'<mujoco model="ball">{FLOOR}<body name="ball" pos="0 0 .2"><freejoint/><geom name="ball" size=".1" mass=".5"/>'
+    "</body></worldbody></mujoco>"
+)
+PENDULUM: Final = """
+<mujoco model="pendulum"><worldbody><body name="pole" pos="0 0 1"><joint name="swing" axis="0 1 0" damping=".01"/>
+  <geom type="capsule" fromto="0 0 0 .1 0 -.5" size=".02" mass=".3"/></body></worldbody>
+  <actuator><motor joint="swing"/></actuator></mujoco>"""
+LIMITED: Final = PENDULUM.replace('damping=".01"', 'limited="true" range="-20 20"').replace(
+    '<actuator><motor joint="swing"/></actuator>', ""
+)
+WHEEL: Final = PENDULUM.replace("0 0 0 .1 0 -.5", "0 -.1 0 0 .1 0")
+UNNAMED: Final = BALL.replace('name="ball"', "").replace('name="floor"', "")
+PILE: Final = (
+    f'<mujoco model="pile">{FLOOR}'
+    + "".join(
+        f'<body name="b{index}" pos="{0.05 * (index % 2)} 0 {0.1 + 0.22 * index}"><joint type="slide" axis="0 0 1"/>'
+        f'<joint type="slide" axis="1 0 0"/><geom name="g{index}" size=".1" mass=".5"/></body>'
+        for index in range(4)
+    )
+    + "</worldbody></mujoco>"
+)
+MODELS: Final = {
+    "arm": ARM,
+    "leg": LEG,
+    "ball": BALL,
+    "pendulum": PENDULUM,
+    "limited": LIMITED,
+    "wheel": WHEEL,
+    "unnamed": UNNAMED,
+    "pile": PILE,
+}
+
+
+def proposed(source: str) -> Proposal:
+    return propose(put_scene(mujoco.MjModel.from_xml_string(source), "model"))
+
+
+def loaded(path: Path) -> ModuleType:
+    module = ModuleType(path.stem)
+    module.__file__ = str(path)
+    exec(compile(path.read_text(), str(path), "exec"), module.__dict__)
+    return module
+
+
+@pytest.fixture
+def begin(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[Task, dict[str, Any], Path]]:
+    """Runs init on an MJCF of that name, and returns the task, the document and the file."""
+
+    def begin(source: str, name: str = "model.xml") -> tuple[Task, dict[str, Any], Path]:
+        mjcf = tmp_path / name
+        mjcf.write_text(source)
+        assert cli.main(["init", str(mjcf), "--json"]) == 0
+        document = json.loads(capsys.readouterr().out)
+        (written,) = map(Path, document["written"])
+        assert written.parent == tmp_path and written.stem == document["task"].partition(":")[0]
+        return getattr(loaded(written), document["task"].partition(":")[2])(), document, written
+
+    return begin
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_gets_a_task(name: str, begin: Callable[..., tuple[Task, dict[str, Any], Path]]) -> None:
+    """Its parts fit together, its cost is finite, and noise changes it; the file is formatted and has no long lines."""
+    task, document, written = begin(MODELS[name], f"{name}.xml")
+    check_shapes(task)
+    check_soundness(task)
+    host = task.scene.host
+    assert task.policy.at_start == (host.nu == 0) and task.theta.dtype == np.float64
+    assert (document["horizon"], document["sigma"]) == (task.horizon, task.sigma)
+    assert task.defaults.recipe is not None and task.defaults.recipe.learning_rate > 0
+    if task.contact_pair is None:
+        assert task.defaults.families == ("mjcf",) and name in ("pendulum", "limited", "wheel", "unnamed")
+    else:
+        low, high = task.defaults.stiffnesses[0], task.defaults.stiffnesses[-1]
+        assert len(set(task.defaults.stiffnesses)) == 4 and high >= 5 * low
+        assert 0.3 < task.scene.timestep * math.sqrt(high / effective_mass(task.scene, *task.contact_pair)) < 0.8
+    found = propose(load_scene(written.with_name(f"{name}.xml")))
+    misses = [found.aim.misses(trial, found.horizon) for trial in proposal._trials(found.drive, found.horizon)[0]]
+    assert np.std(misses) > 0 and all(math.isfinite(each) for each in misses)
+    ruff = [sys.executable, "-m", "ruff", "--isolated", "--quiet"]
+    settings = ["--line-length", "120", "-"]
+    for command in (["format", "--check"], ["check", "--select", "E,F,I,W"]):
+        done = subprocess.run([*ruff, *command, *settings], input=written.read_text(), text=True, capture_output=True)
+        assert done.returncode == 0, done.stdout + done.stderr + written.read_text()
+
+
+def test_the_cost_is_that_of_the_test_rollouts(begin: Callable[..., tuple[Task, dict[str, Any], Path]]) -> None:
+    """The file's cost of a rollout in C is the proposal's."""
+    task, _, written = begin(ARM, "arm.xml")
+    found = propose(load_scene(written.with_name("arm.xml")))
+    change = np.full((1, 2), 0.3)
+    trial = proposal.run_trial(found.drive, change, task.horizon)
+    state = initial_state(task.scene)
+    last = dataclasses.replace(state, qpos=jnp.asarray(trial.qpos[-1]))
+    assert "(shoulder, elbow)" in written.read_text()
+    effort = float(task.costs()[0](state, jnp.asarray(found.drive.neutral + change[0]))) * task.horizon
+    assert float(task.costs()[1](last)) == pytest.approx(found.aim.misses(trial, task.horizon), rel=1e-9)
+    assert effort == pytest.approx(proposal.WEIGHT * (0.3 / (10 * task.sigma)) ** 2)
+
+
+def test_what_a_task_is_about() -> None:
+    """A load that noise moves, a trunk that walks, else a tip; the goal lies where held controls reach."""
+    arm, leg, pendulum, wheel = map(proposed, (ARM, LEG, PENDULUM, WHEEL))
+    assert arm.aim.role == "load" and arm.aim.body == arm.scene.body("ball") and arm.aim.axis == 0
+    assert set(arm.pair or ()) == {"hand", "ball"}
+    assert leg.aim.role == "trunk" and leg.aim.body == leg.scene.body("torso")
+    assert leg.pair == ("floor", "foot") and leg.touches and leg.drive.neutral.tolist() == [0.1, 0]
+    assert leg.drive.scale == 0.1 and 0 < leg.aim.goal[0] - leg.aim.end[0] < 1
+    assert pendulum.aim.role == "tip" and wheel.aim.body is None and wheel.aim.role == "coordinate"
+    assert proposed(LIMITED).limits == ("swing",)
+
+
+def test_contacts_are_those_of_a_fall() -> None:
+    """A ball falls 0.1 m: after sqrt(2 s / g) = 0.143 s, at sqrt(2 g s) = 1.40 m/s; its noise is 0.1 m/s."""
+    found = proposed(BALL)
+    (touch,) = found.touches.values()
+    assert touch.first * 0.004 == pytest.approx(math.sqrt(0.2 / 9.81), abs=0.02)
+    assert touch.speed == pytest.approx(math.sqrt(2 * 9.81 * 0.1), rel=0.1)
+    assert found.load is not None and found.load.weight == pytest.approx(0.5 * 9.81)
+    assert found.load.depth(found.load.stiffness(0.01)) == pytest.approx(0.01)
+    assert found.horizon * 0.004 >= max(2 * 0.143 - 0.01, 0.5)
+
+
+def test_a_learning_rate_lowers_the_cost() -> None:
+    found = proposed(LEG)
+    aim, drive, steps = found.aim, found.drive, found.horizon
+    cost = lambda held: aim.misses(proposal.run_trial(drive, np.array([held]), steps), steps)  # noqa: E731
+    slope = np.array([cost(move) - cost(-move) for move in drive.scale * np.eye(2)]) / (2 * drive.scale * steps)
+    assert cost(-found.learning_rate * slope) < 0.9 * cost(np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>',
+            "has no degree of freedom: there is nothing to study",
+        ),
+        (
+            PENDULUM.replace('damping=".01"', 'armature="1e12"'),
+            "noise on its controls of .* moves not",
+        ),
+        (PENDULUM.replace('damping=".01"', 'stiffness="1e300" springref="90"'), "state is not finite after step"),
+        ("<mujoco>", "is not a valid MJCF"),
+    ],
+)
+def test_a_model_without_a_task_gets_a_reason(
+    source: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "model.xml"
+    path.write_text(source)
+    assert cli.main(["init", str(path)]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["model.xml"]
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    with pytest.raises(ValueError, match=message):
+        propose(load_scene(path))
+
+
+def test_a_file_is_only_replaced_by_force(
+    begin: Callable[..., tuple[Task, dict[str, Any], Path]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, _, written = begin(PENDULUM)
+    written.write_text("mine")
+    mjcf = str(written.with_name("model.xml"))
+    assert cli.main(["init", mjcf]) == 2 and written.read_text() == "mine"
+    assert capsys.readouterr().err == f"mjx-study: {written} exists: give --force to replace it\n"
+    assert cli.main(["init", mjcf, "--force"]) == 0 and "def model(" in written.read_text()
+    assert f"cd {written.parent} && mjx-study compare model_task:model" in capsys.readouterr().out
+    assert cli.main(["init", "pusher"]) == 2
+    assert capsys.readouterr().err == "mjx-study: init needs the path of an MJCF, FILE.xml, got pusher\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("my-robot.v2.xml", "my_robot_v2"),
+        ("2legs.xml", "model_2legs"),
+        ("class.xml", "model_class"),
+        ("jnp.XML", "model_jnp"),
+    ],
+)
+def test_names_of_files_become_names_in_python(file: str, name: str) -> None:
+    assert function_name(Path(file)) == name
+    source = source_of_task(Path(file), proposed(PENDULUM.replace('"pole"', '"a &quot;pole&quot;"')))
+    compile(source, file, "exec")
+    assert f"def {name}(" in source and r'scene.body("a \"pole\"")' in source
+
+
+COMMANDS: Final = (
+    "compare {} --samples 4 --reference-samples 4",
+    "optimise {} --iterations 2 --samples 4 --seeds 1",
+    "sweep {} --samples 4 --seeds 1 --reference-samples 4 --output sweep",
+    "landscape {} --points 3 --samples 4",
+    "rollout {} --output film",
+    "gradcheck {} --states 1",
+    "bench {} --samples 5",
+    "diagnose {} --samples 23",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["arm", "leg", "ball", "pendulum", "limited"])
+def test_every_command_runs_the_file_as_it_is(name: str, tmp_path: Path) -> None:
+    (tmp_path / f"{name}.xml").write_text(MODELS[name])
+    assert cli.main(["init", str(tmp_path / f"{name}.xml")]) == 0
+    swept = name in ("arm", "leg", "ball")
+    environment = os.environ | {"XDG_CACHE_HOME": str(ROOT / ".pytest_cache" / "own_task"), "PYTHONPATH": str(ROOT)}
+    for command in COMMANDS:
+        words = command.format(f"{name}_task:{name}").split()
+        one = ["--contact", "mujoco"] if swept and words[0] in ("compare", "optimise", "sweep") else []
+        full = [sys.executable, "-m", "mjx_study", *words, *one, "--horizon", "40"]
+        done = subprocess.run(full, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=900)
+        assert done.returncode in ((0, 3) if words[0] == "gradcheck" else (0,)), f"{command}: {done.stderr}"
+        assert "nan" not in done.stdout.split(), f"{command}: {done.stdout}"

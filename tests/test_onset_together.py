@@ -1,0 +1,135 @@
+r"""Contacts that begin together: their jumps add up, and their derivatives are those of one contact of joint strength.
+
+n equal frictionless contacts of impedance d at a body that cannot turn are one contact of impedance n d/(1 + (n - 1) d)
+with the same damping b and stiffness k d.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_study.simulation import constraint, guards
+from mjx_study.simulation.branches import jump_term
+from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.drop_in import step
+from mjx_study.simulation.dynamics import advance_velocity, force_stage, initial_state, position_stage, rollout
+from mjx_study.simulation.onset import corrected_rollout, guard_at, on_and_off
+from mjx_study.simulation.touch import Crossings, Events
+from tests.scenes import floor_scene, option, scene_of
+from tests.test_onset_term import LAW, compiled
+
+CORNERS = 4
+FALLING = '<body pos="0 0 .1"><joint type="slide" axis="0 0 1"/>{}</body>'
+BALL, BOX = (
+    FALLING.format(f'<geom name="body" {shape} mass="1" condim="1"/>')
+    for shape in ('size=".1"', 'type="box" size=".2 .1 .1"')
+)
+
+
+def contact(damping: float, stiffness: float, impedance: float) -> ContactModel:
+    """Of damping b [1/s], stiffness k d [1/s^2] and constant impedance d."""
+    solref = -jnp.array([stiffness * impedance, damping * impedance])
+    return ContactModel(solref, jnp.array([impedance, impedance, 1e-3, 0.5, 2.0]))
+
+
+def falls(body: str, law: ContactModel, gaps: np.ndarray, by_steps: bool) -> np.ndarray:
+    """Last gap, and its derivative by the first with the linear term; the derivative of a cost with the jump."""
+    scene = scene_of(floor_scene(body, option(2e-3, "", 'refsafe="disable"'), 'condim="1"'))
+    model = apply_contact(scene.model, law)
+    cost = lambda state: 100 * (state.qpos[0] - 0.02) ** 2  # noqa: E731
+    speed, steps = jnp.array([-1.0]), 60
+
+    def linear(gap):
+        states, *_, counts = corrected_rollout(scene, model, initial_state(scene, gap[None], speed), LAW, steps)
+        return states.qpos[-1, 0], counts.found
+
+    def jump(gap):
+        states, controls, _ = rollout(scene, model, initial_state(scene, gap[None], speed), LAW, steps)
+        term, counts = jump_term(scene, model, states, controls, LAW, lambda *_: jnp.zeros(()), cost)
+        return cost(jax.tree.map(lambda leaf: leaf[-1], states)) + term, counts.found
+
+    def drop_in(gap):
+        advance = lambda data, _: (step(model, data, onset="linear"), None)  # noqa: E731
+        start = scene.template.replace(qpos=gap[None], qvel=speed)
+        return jax.lax.scan(advance, start, length=steps)[0].qpos[0]
+
+    def sample(gap):
+        if by_steps:
+            return jnp.stack(jax.value_and_grad(drop_in)(gap)), None
+        (value, found), of_linear = jax.value_and_grad(linear, has_aux=True)(gap)
+        of_jump, also_found = jax.grad(jump, has_aux=True)(gap)
+        return jnp.stack([value, of_linear, of_jump]), jnp.stack([found, also_found])
+
+    values, found = compiled(jax.vmap(sample), gaps)
+    assert found is None or np.all(found == (1 if body is BALL else CORNERS))
+    return values
+
+
+@pytest.mark.parametrize(
+    "by_steps", [pytest.param(False, id="of a rollout"), pytest.param(True, id="of steps", marks=pytest.mark.slow)]
+)
+def test_four_corners_have_the_derivatives_of_one_contact(by_steps: bool) -> None:
+    """Which begins, and ends under the body's weight."""
+    damping, stiffness, impedance = 3.5, 1e4, 0.5
+    joint = CORNERS * impedance / (1 + (CORNERS - 1) * impedance)
+    gaps = np.linspace(0.0311, 0.0464, 7)
+    of_box = falls(BOX, contact(damping, stiffness, impedance), gaps, by_steps)
+    of_ball = falls(BALL, contact(damping, stiffness, joint), gaps, by_steps)
+    np.testing.assert_allclose(of_box[:, 0], of_ball[:, 0], rtol=0, atol=1e-12)
+    scale = np.abs(of_ball).max(axis=0)
+    np.testing.assert_allclose(of_box / scale, of_ball / scale, rtol=0, atol=1e-9)
+
+
+# Four corners with friction, the limit of a hinge and that of a tendon, all of them barely passed.
+MIXED = floor_scene(
+    '<body pos="0 0 .0999"><joint name="x" type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
+    '<joint type="hinge" axis="0 1 0" range=".0057 50" limited="true"/>'
+    '<geom name="box" type="box" size=".2 .1 .1" mass="1"/></body>',
+    option(4e-3, "", 'refsafe="disable"'),
+).replace(
+    "</mujoco>",
+    '<tendon><fixed limited="true" range=".0001 1"><joint joint="x" coef="1"/></fixed></tendon></mujoco>',
+)
+
+
+def test_jumps_of_a_step_add_up_whatever_their_order() -> None:
+    """The velocity with everything that begins, less that with what ends, for random orders and ties."""
+    scene = scene_of(MIXED)
+    model = apply_contact(scene.model, contact(100.0, 0.0, 0.5))
+    solref, solimp = jnp.array([[0.0, -50.0]]), jnp.array([[0.5, 0.5, 1e-3, 0.5, 2.0]])
+    model = model.replace(
+        jnt_solref=jnp.tile(solref, (3, 1)),
+        jnt_solimp=jnp.tile(solimp, (3, 1)),
+        tendon_solref_lim=solref,
+        tendon_solimp_lim=solimp,
+    )
+    qvel = jnp.array([-0.8, -1.3, -2.0])
+    positioned = position_stage(scene, model, scene.template.qpos)
+    forced = force_stage(model, positioned, qvel, jnp.zeros(0), jnp.zeros(0))
+    _, members = guards.guard_rows(model, positioned)
+    count = len(members)
+    assert count == CORNERS + 2
+
+    def sums(since, begins):
+        crossing, no = Crossings(begins, ~begins, since), jnp.zeros((), bool)
+
+        def jump(guard):
+            event = Events(jnp.zeros((), int), guard, ~begins[guard], no, *crossing.others(guard), ~no)
+            (after, _), _ = on_and_off(model, forced, guard_at(model, positioned, qvel, event))
+            return jnp.where(begins[guard], 1.0, -1.0) * (after[0] - after[1])
+
+        def velocity(kept):
+            prepared = guards.without(forced, (~kept).astype(qvel.dtype) @ members)
+            return advance_velocity(model, prepared, constraint.run_solver(model, prepared))[0]
+
+        return jnp.sum(jax.vmap(jump)(jnp.arange(count)), axis=0), velocity(begins) - velocity(~begins)
+
+    random = np.random.default_rng(0)
+    since = random.uniform(size=(12, count))
+    since[:4] = np.round(since[:4] * 2) / 2  # ties
+    begins = random.uniform(size=(12, count)) < 0.5
+    begins[:2] = True
+    added, expected = compiled(jax.vmap(sums), since, begins)
+    np.testing.assert_allclose(added, expected, rtol=0, atol=1e-9)
+    assert np.all(np.abs(expected).max(axis=1) > 0.04)
