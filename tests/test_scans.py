@@ -207,9 +207,10 @@ def test_networks_and_their_libraries(monkeypatch):
     agree(task, monkeypatch, ["value", "gradient"])
     monkeypatch.setenv(SWITCH, "1")
     contact = single_contact(task)[0].contact
-    program = jax.make_jaxpr(with_native_scans(SamplePrograms(task)._sample_value))
-    traced = str(program(task.theta, contact, task.sigma, np.zeros(2, np.uint32), 1.0))
-    assert traced.count("native[") == 1 and "scan[" not in traced
+    for name, loops in (("value", 1), ("gradient", 2)):
+        program = jax.make_jaxpr(with_native_scans(SamplePrograms(task).by_name[name]))
+        traced = str(program(task.theta, contact, task.sigma, np.zeros(2, np.uint32), 1.0))
+        assert traced.count("native[") == loops and "scan[" not in traced
     monkeypatch.setattr(scans, "MOST_CARRIED", 50)
     agree(task, monkeypatch, ["value", "gradient"])
     assert "50 values from pass to pass" in native.native_summary()

@@ -77,6 +77,14 @@ def _place_of_extreme(better: Any) -> Rule:
 
 
 @no_type_check
+def _one_minus_square(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
+    """(1 + x) (1 - x), an operation of its own from JAX 0.11 on."""
+    one = constants(np.ones((), aval.dtype))
+    factors = [graph.elementwise(primitive, [one, inputs[0]], aval) for primitive in (lax.add_p, lax.sub_p)]
+    return [graph.elementwise(lax.mul_p, factors, aval)]
+
+
+@no_type_check
 def _cumsum(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     result = inputs[0].copy()
     rows = np.moveaxis(np.flip(result, parameters["axis"]) if parameters["reverse"] else result, parameters["axis"], 0)
@@ -118,6 +126,7 @@ RULES: Final[dict[str, Rule]] = {
     "iota": lambda _, __, aval, parameters: [
         constants(np.indices(aval.shape)[parameters["dimension"]].astype(aval.dtype))
     ],
+    "one_minus_square": _one_minus_square,
     "pad": _pad,
     "reduce_and": _reduction(lax.and_p),
     "reduce_max": _reduction(lax.max_p),

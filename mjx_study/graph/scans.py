@@ -20,9 +20,9 @@ from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, run, sc
 from mjx_study.graph.native import NativeFunction, building_postponed, count_left, native_identity
 from mjx_study.graph.nodes import ScalarGraph, TooLargeError, constants
 
-MOST_OPERATIONS: Final = 15_000
+MOST_OPERATIONS: Final = 4_000
 """Maximum number of scalar operations in a pass. Longer ones spend their time in the native code that they call, which
-programs share."""
+programs share, and registers do not suffice for what surrounds it."""
 MOST_CARRIED: Final = 500
 """Maximum number of scalars from one pass to the next."""
 
