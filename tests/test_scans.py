@@ -182,7 +182,7 @@ def agree(task, monkeypatch, names, tolerance=1e-11):
     for name, ours, theirs in zip(names, *batch_of(task, monkeypatch, names), strict=True):
         for one, other in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(
-                one, other, rtol=0, atol=tolerance * np.max(np.abs(other), initial=1e-3), err_msg=name
+                one, other, rtol=0, atol=tolerance * np.max(np.abs(np.nan_to_num(other)), initial=1e-3), err_msg=name
             )
 
 
