@@ -80,6 +80,11 @@ FUNCTIONS = {
     "products": lambda x: jnp.einsum("bij,bjk->bik", jnp.stack([jnp.outer(x, x)] * 2), jnp.ones((2, 3, 2), int)),
     "products of what is computed": lambda x: jnp.outer(x, jnp.sin(x)) @ jnp.stack([x, x**2], 1),
     "sums": lambda x: (jnp.cumsum(x), jax.lax.cumsum(x, reverse=True), jnp.sum(jnp.outer(x, x), 0)),
+    "sums along any axis": lambda x: [
+        jax.lax.cumsum(jnp.stack([jnp.outer(x, x**2), jnp.outer(x, jnp.sin(x))]), axis, reverse)
+        for axis in range(3)
+        for reverse in (False, True)
+    ],
     "reductions": lambda x: (jnp.max(x), jnp.min(jnp.outer(x, x), axis=1), jnp.any(x > 1), jnp.all(x > -9)),
     "first of equals": lambda x: (jnp.argmax(jnp.abs(jnp.round(x)) * 0), jnp.argmin(jnp.outer(x, x), axis=1)),
     "whole arrays": lambda x: (jnp.sort(x), jnp.linalg.cholesky(jnp.outer(x, x) + 9 * jnp.eye(3))),
@@ -121,6 +126,7 @@ def test_the_value_is_the_functions(name, native, monkeypatch):
         "products",
         "products of what is computed",
         "sums",
+        "sums along any axis",
         "reductions",
     ],
 )
