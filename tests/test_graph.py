@@ -29,6 +29,41 @@ def _newton_root(x):
     )
 
 
+def _members(x):
+    """Members for which the loops below run differently often, some of them not at all."""
+    return jnp.stack([x, x[::-1] / 2, 3 * x, 0 * x])
+
+
+def _until(limit, carry, by=1.7):
+    """Grow an array until its sum of magnitudes reaches a limit; the passes, and a value that no pass changes."""
+    size = lambda y: jnp.sum(jnp.abs(y))  # noqa: E731
+    return jax.lax.while_loop(
+        lambda carry: (size(carry[0]) < limit) & (carry[1] < 30),
+        lambda carry: (by * carry[0] + carry[2], carry[1] + 1, carry[2]),
+        (carry, 0, jnp.sum(carry) / 9),
+    )
+
+
+def _loop_in_loop(x):
+    """A loop whose passes run a loop, both of a length that depends on the member."""
+    return jax.lax.while_loop(
+        lambda carry: (carry[1] < 5) & (carry[0] < 40.0),
+        lambda carry: (_until(carry[0] + 2, jnp.stack([x[0], carry[0]]))[0][1] + 0.5, carry[1] + 1),
+        (jnp.abs(x[1]), 0),
+    )
+
+
+def _loop_in_branch(x):
+    """A loop of a computed length in a branch that some members take, and one of a known length in the other."""
+    length = jnp.abs(x[1] * 3).astype(int)
+    return jax.lax.cond(
+        x[0] < 1.0,
+        lambda y: jax.lax.fori_loop(0, length, lambda index, z: z * 1.5 + index, y),
+        lambda y: jax.lax.fori_loop(0, 3, lambda index, z: z - index, y),
+        x,
+    )
+
+
 FUNCTIONS = {
     "elementwise": lambda x: jnp.where(x > 0, jnp.sin(x) * x**3, jnp.exp(-x)) + jnp.arctan2(x, 2) / jnp.sqrt(1 + x**2),
     "integers": lambda x: (jnp.floor(x).astype(int) % 3, ~(x > 0) | (x < -1), jnp.sign(x), jnp.clip(x, -1, 1)),
@@ -45,18 +80,33 @@ FUNCTIONS = {
     "products": lambda x: jnp.einsum("bij,bjk->bik", jnp.stack([jnp.outer(x, x)] * 2), jnp.ones((2, 3, 2), int)),
     "products of what is computed": lambda x: jnp.outer(x, jnp.sin(x)) @ jnp.stack([x, x**2], 1),
     "sums": lambda x: (jnp.cumsum(x), jax.lax.cumsum(x, reverse=True), jnp.sum(jnp.outer(x, x), 0)),
+    "sums along any axis": lambda x: [
+        jax.lax.cumsum(jnp.stack([jnp.outer(x, x**2), jnp.outer(x, jnp.sin(x))]), axis, reverse)
+        for axis in range(3)
+        for reverse in (False, True)
+    ],
     "reductions": lambda x: (jnp.max(x), jnp.min(jnp.outer(x, x), axis=1), jnp.any(x > 1), jnp.all(x > -9)),
     "first of equals": lambda x: (jnp.argmax(jnp.abs(jnp.round(x)) * 0), jnp.argmin(jnp.outer(x, x), axis=1)),
     "whole arrays": lambda x: (jnp.sort(x), jnp.linalg.cholesky(jnp.outer(x, x) + 9 * jnp.eye(3))),
     "loops": _newton_root,
+    "loop of members": lambda x: jax.vmap(partial(_until, 9.0))(_members(x)),
+    "loop of members with limits of their own": lambda x: jax.vmap(_until)(3 * jnp.arange(1, 4) + x, _members(x)[:3]),
+    "loop of members with limits alone": lambda x: jax.vmap(_until, (0, None))(x**2 + 3, x),
+    "loop of members that grow differently": lambda x: jax.vmap(_until, (None, None, 0))(9.0, x, 2 + x**2),
+    "loop of members of members": lambda x: jax.vmap(jax.vmap(_until, (0, None)), (None, 0))(x**2 + 3, _members(x)),
+    "loop of members along another axis": lambda x: jax.vmap(lambda y: _until(9.0, y)[0], 1, 1)(_members(x)),
+    "loop in a loop of members": lambda x: jax.vmap(_loop_in_loop)(_members(x)),
+    "loops in branches of members": lambda x: jax.vmap(_loop_in_branch)(_members(x)),
     "loop of no step": lambda x: jax.lax.fori_loop(0, 0, lambda _, y: y * 2, x),
     "empty": lambda x: (x[:0], jnp.sum(x[:0]), jnp.zeros((0, 3)) @ x, jnp.zeros((2, 0)) @ x[:0]),
     "constants": lambda x: (jnp.ones(2), 3, jnp.sum(TABLE)),
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("native", [pytest.param("1", id="native"), pytest.param("0", id="operations")])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_the_value_is_the_functions(name):
+def test_the_value_is_the_functions(name, native, monkeypatch):
+    monkeypatch.setenv(SWITCH, native)
     points = np.stack([ROW, ROW[::-1], -2 * ROW, np.zeros(3) + 1])
     function = FUNCTIONS[name]
     plain = jax.jit(jax.vmap(function))(points)
@@ -76,6 +126,7 @@ def test_the_value_is_the_functions(name):
         "products",
         "products of what is computed",
         "sums",
+        "sums along any axis",
         "reductions",
     ],
 )

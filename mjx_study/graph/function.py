@@ -275,17 +275,23 @@ def _copy(graph: ScalarGraph, nodes: Iterable[Node], values: dict[int, Any]) -> 
 
 
 def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """While loop over scalars, with loop invariants computed beforehand."""
+    """While loop over scalars, with loop invariants computed beforehand.
+
+    That of a function under `vmap` has one predicate per member, whose shape begins that of every carried array: it
+    runs until all members have ended, and a member that has ended keeps its values.
+    """
     parameters, avals = equation.params, [each.aval for each in equation.outvars]
     first, second = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
     during = [graph.fresh("carry", aval.shape, aval.dtype) for aval in avals]
-
-    def inside(of: str, consts: list[np.ndarray]) -> list[Any]:
-        return entries_of(run(graph, parameters[of], [*consts, *during]))
-
-    again, after = inside("cond_jaxpr", inputs[:first]), inside("body_jaxpr", inputs[first:second])
+    (members,) = run(graph, parameters["cond_jaxpr"], [*inputs[:first], *during])
+    after = run(graph, parameters["body_jaxpr"], [*inputs[first:second], *during])
+    again = graph.reduced(lax.or_p, members.reshape(-1), ShapedArray((), np.dtype(bool)))
+    if members.ndim:
+        wide = [members.reshape(*members.shape, *[1] * (len(aval.shape) - members.ndim)) for aval in avals]
+        cases = zip(wide, during, after, avals, strict=True)
+        after = [graph.elementwise(lax.select_n_p, each, aval) for *each, aval in cases]
     carried = entries_of(during)
-    node = _loop_node(graph, entries_of(inputs[second:]), carried, again, after)
+    node = _loop_node(graph, entries_of(inputs[second:]), carried, entries_of([again]), entries_of(after))
     flat = [ShapedArray((), each.dtype) for each in carried]
     scalars = iter([each[()] for each in graph.outputs(node, flat)])
     return [filled(aval.shape, itertools.islice(scalars, math.prod(aval.shape))) for aval in avals]

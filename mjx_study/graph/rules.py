@@ -88,8 +88,9 @@ def _one_minus_square(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters:
 def _cumsum(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     result = inputs[0].copy()
     rows = np.moveaxis(np.flip(result, parameters["axis"]) if parameters["reverse"] else result, parameters["axis"], 0)
-    for before, row in itertools.pairwise(rows.reshape(len(rows), -1)):
-        row[:] = [graph.scalar(lax.add_p, each, aval.dtype) for each in zip(before, row, strict=True)]
+    for before, row in itertools.pairwise(range(len(rows))):  # by index, because a reshaped view may be a copy
+        kind = aval.update(shape=rows.shape[1:])
+        rows[row, ...] = graph.elementwise(lax.add_p, [rows[before, ...], rows[row, ...]], kind)
     return [result]
 
 
