@@ -27,7 +27,8 @@ import jax.export
 from estimators.user_inputs import inputs_now, observing, sources_and_inputs
 from mjx_study.caches import read_cached, write_cached
 from mjx_study.graph.build import known_libraries, libraries_in, library_ready
-from mjx_study.graph.native import native_identity
+from mjx_study.graph.native import count_left, native_identity
+from mjx_study.graph.scans import scans_as_they_are
 from mjx_study.identity import TraceContents, trace_contents
 from mjx_study.runtime import available_cores, precision, traces_folder
 from mjx_study.simulation.scene import Scene
@@ -39,6 +40,9 @@ UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices|async_dispatch")
 """JAX settings that traces do not depend on."""
 GRAPHS: Final = "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
 """Operations that XLA records in CUDA graphs: its default ones and whole loops, whose steps the host would launch."""
+
+LOST_CALL: Final = "No registered implementation for untyped custom call"
+"""XLA's message for a call of native code whose type it has lost, as it does in some large programs."""
 
 
 class Compiled:
@@ -135,8 +139,12 @@ class Compiled:
             lowered = ready.lower(*form.unflatten(types))
             try:
                 self._ready[key] = lowered.compile(options)
-            except jax.errors.JaxRuntimeError:
-                if options is None:
+            except jax.errors.JaxRuntimeError as error:
+                if LOST_CALL in str(error):
+                    count_left("loop in a program in which XLA loses its type")
+                    with scans_as_they_are():
+                        lowered = jax.jit(_named(self._function, self._name)).lower(*form.unflatten(types))
+                elif options is None:
                     raise
                 self._ready[key] = lowered.compile()
 

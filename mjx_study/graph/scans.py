@@ -5,7 +5,9 @@ costs, and the sums of reverse mode. Here a whole program is traced, differentia
 becomes one function whose body is a graph, native code that it calls included.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, Final
 
 import jax
@@ -26,13 +28,25 @@ programs share, and registers do not suffice for what surrounds it."""
 MOST_CARRIED: Final = 500
 """Maximum number of scalars from one pass to the next."""
 
+_AS_THEY_ARE: Final = ContextVar("_AS_THEY_ARE", default=False)
+
+
+@contextmanager
+def scans_as_they_are() -> Generator[None]:
+    """Trace functions `with_native_scans` as if they were without."""
+    token = _AS_THEY_ARE.set(True)
+    try:
+        yield
+    finally:
+        _AS_THEY_ARE.reset(token)
+
 
 def with_native_scans(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function of pytrees of arrays with its scans as native code where possible; to be batched, not
     differentiated."""
 
     def program(*arguments: Any) -> Any:
-        if native_identity() is None:
+        if native_identity() is None or _AS_THEY_ARE.get():
             return function(*arguments)
         with building_postponed():
             closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
