@@ -154,7 +154,8 @@ def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[n
 
     for equation in jaxpr.eqns:
         outputs = _equation(graph, equation, [read(atom) for atom in equation.invars])
-        values |= zip(equation.outvars, outputs, strict=True)
+        boxed = [each if isinstance(each, np.ndarray) else filled((), [each]) for each in outputs]  # NumPy unboxes
+        values |= zip(equation.outvars, boxed, strict=True)
     return [read(atom) for atom in jaxpr.outvars]
 
 
