@@ -269,6 +269,7 @@ def test_a_trace_is_made_again_where_a_library_that_it_calls_is_missing(folder: 
         evaluated(pusher())
 
 
+@pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
 def test_traces_with_and_without_native_code_are_apart(folder: Path, monkeypatch: pytest.MonkeyPatch):
     first = evaluated(pusher())
     jax.clear_caches()
