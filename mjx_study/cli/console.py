@@ -136,8 +136,10 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
     uncertainty = [row.reference_uncertainty for row in rows if math.isfinite(row.reference_uncertainty)]
     if uncertainty:
         pairs = dataset.get("reference_pairs", xr.DataArray(config["reference_samples"])).values
+        fewest, most = (f"{int(each):,}" for each in (np.nanmin(pairs), np.nanmax(pairs)))
         lines += [
-            f"Errors are against an unbiased zeroth-order reference gradient, {_range(pairs, 9)} pairs "
+            "Errors are against an unbiased zeroth-order reference gradient, "
+            f"{fewest if fewest == most else f'{fewest} to {most}'} pairs "
             "of rollouts with a control variate;",
             f"its own relative uncertainty is {_range(uncertainty, 2)}, and smaller errors are not significant.",
             MARKS,
