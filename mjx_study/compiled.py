@@ -27,8 +27,8 @@ import jax.export
 from estimators.user_inputs import inputs_now, observing, sources_and_inputs
 from mjx_study.caches import read_cached, write_cached
 from mjx_study.graph.build import known_libraries, libraries_in, library_ready
-from mjx_study.graph.native import count_left, native_identity
-from mjx_study.graph.scans import scans_as_they_are
+from mjx_study.graph.native import count_left, native_identity, switched_on
+from mjx_study.graph.scans import AS_THEY_ARE
 from mjx_study.identity import TraceContents, trace_contents
 from mjx_study.runtime import available_cores, precision, traces_folder
 from mjx_study.simulation.scene import Scene
@@ -142,7 +142,7 @@ class Compiled:
             except jax.errors.JaxRuntimeError as error:
                 if LOST_CALL in str(error):
                     count_left("loop in a program in which XLA loses its type")
-                    with scans_as_they_are():
+                    with switched_on(AS_THEY_ARE):
                         lowered = jax.jit(_named(self._function, self._name)).lower(*form.unflatten(types))
                 elif options is None:
                     raise

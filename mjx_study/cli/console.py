@@ -136,12 +136,11 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
     uncertainty = [row.reference_uncertainty for row in rows if math.isfinite(row.reference_uncertainty)]
     if uncertainty:
         pairs = dataset.get("reference_pairs", xr.DataArray(config["reference_samples"])).values
-        fewest, most = (f"{int(each):,}" for each in (np.nanmin(pairs), np.nanmax(pairs)))
         lines += [
-            "Errors are against an unbiased zeroth-order reference gradient, "
-            f"{fewest if fewest == most else f'{fewest} to {most}'} pairs "
+            f"Errors are against an unbiased zeroth-order reference gradient, {_range(pairs, '{:,.0f}'.format)} pairs "
             "of rollouts with a control variate;",
-            f"its own relative uncertainty is {_range(uncertainty, 2)}, and smaller errors are not significant.",
+            f"its own relative uncertainty is {_range(uncertainty, partial(number, digits=2))}, and smaller errors are "
+            "not significant.",
             MARKS,
         ]
     lines.append("ms: computing time of one sample; variance x s: the variance times it, in seconds.")
@@ -153,9 +152,9 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
     return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
-def _range(values: Any, digits: int) -> str:
+def _range(values: Any, show: Callable[[float], str]) -> str:
     """The smallest and the largest finite value, or the only one."""
-    low, high = number(float(np.nanmin(values)), digits), number(float(np.nanmax(values)), digits)
+    low, high = show(float(np.nanmin(values))), show(float(np.nanmax(values)))
     return low if low == high else f"{low} to {high}"
 
 

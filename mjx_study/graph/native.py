@@ -25,7 +25,7 @@ SWITCH: Final = "MJX_STUDY_NATIVE"
 """Environment variable; 0 does without native code."""
 _LEFT: Final[Counter[str]] = Counter()
 """Numbers of functions left to XLA, by reason."""
-_POSTPONED: Final[ContextVar[bool]] = ContextVar("postponed", default=False)
+POSTPONED: Final[ContextVar[bool]] = ContextVar("postponed", default=False)
 """Whether functions are called without building their libraries."""
 
 
@@ -72,7 +72,7 @@ def as_native(values: ScalarFunction, function: ScalarFunction, *, early: bool =
         lambda: written_out(function),
         values,
     )
-    return native if not early or _POSTPONED.get() or native.begun() else None
+    return native if not early or POSTPONED.get() or native.begun() else None
 
 
 class NativeFunction:
@@ -127,13 +127,13 @@ class NativeFunction:
 
 
 @contextmanager
-def building_postponed() -> Generator[None]:
-    """Leave it to whoever needs a library of functions that are called here to build it."""
-    token = _POSTPONED.set(True)
+def switched_on(switch: ContextVar[bool]) -> Generator[None]:
+    """Set a switch, such as `POSTPONED`, in this context."""
+    token = switch.set(True)
     try:
         yield
     finally:
-        _POSTPONED.reset(token)
+        switch.reset(token)
 
 
 def _plain(function: NativeFunction, batch: tuple[int, ...]) -> Callable[..., list[jax.Array]]:

@@ -5,8 +5,7 @@ costs, and the sums of reverse mode. Here a whole program is traced, differentia
 becomes one function whose body is a graph, native code that it calls included.
 """
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import Any, Final
 
@@ -19,7 +18,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from mjx_study.graph.c import NotWrittenError, source_of
 from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, run, scan_inputs
-from mjx_study.graph.native import NativeFunction, building_postponed, count_left, native_identity
+from mjx_study.graph.native import POSTPONED, NativeFunction, count_left, native_identity, switched_on
 from mjx_study.graph.nodes import ScalarGraph, TooLargeError, constants
 
 MOST_OPERATIONS: Final = 4_000
@@ -28,17 +27,8 @@ programs share, and registers do not suffice for what surrounds it."""
 MOST_CARRIED: Final = 500
 """Maximum number of scalars from one pass to the next."""
 
-_AS_THEY_ARE: Final = ContextVar("_AS_THEY_ARE", default=False)
-
-
-@contextmanager
-def scans_as_they_are() -> Generator[None]:
-    """Trace functions `with_native_scans` as if they were without."""
-    token = _AS_THEY_ARE.set(True)
-    try:
-        yield
-    finally:
-        _AS_THEY_ARE.reset(token)
+AS_THEY_ARE: Final = ContextVar("as they are", default=False)
+"""Switch: functions `with_native_scans` are traced as if they were without."""
 
 
 def with_native_scans(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -46,9 +36,9 @@ def with_native_scans(function: Callable[..., Any]) -> Callable[..., Any]:
     differentiated."""
 
     def program(*arguments: Any) -> Any:
-        if native_identity() is None or _AS_THEY_ARE.get():
+        if native_identity() is None or AS_THEY_ARE.get():
             return function(*arguments)
-        with building_postponed():
+        with switched_on(POSTPONED):
             closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
         leaves, structure = jax.tree.flatten(shape)
         jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(leaves), instantiate=True)
