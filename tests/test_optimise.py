@@ -239,7 +239,7 @@ def test_one_compilation_for_all_iterations(monkeypatch: pytest.MonkeyPatch) -> 
     run_study(StudyConfig(tasks=(weak,), estimators=("zobg",), **chosen))
     steps = {program.__wrapped__: program._cache_size() for program in compiled}
     steps = {getattr(function, "__name__", None): size for function, size in steps.items()}
-    assert steps["<lambda>"] == steps["simulated_update"] == 1  # the keys of an iteration, and the iteration
+    assert steps["<lambda>"] == steps["descent"] == 1  # the keys of an iteration, and the iteration
 
 
 @pytest.mark.slow
