@@ -155,22 +155,12 @@ def affordable(seconds: float, chunk: int) -> int:
     return min(SAMPLES, MAX_PATHS * chunk * calls - 1)
 
 
-def begin_programs(simulator: Simulator, contact: ContactModel | None) -> Builds:
-    """Trace the programs of all estimators, and begin to compile them side by side."""
-    builds, key = Builds(), jax.random.split(jax.random.key(0), 1)
-    blank = BlankObjective(**vars(simulator.objective(contact)), builds=builds)
-    for oracle in oracles_of(estimators_of(simulator.task), "evaluation"):
-        getattr(blank, ORACLES[oracle].method)(simulator.task.theta, key)
-    return builds
-
-
 def measure(
     simulator: Simulator,
     contact: ContactModel | None,
     samples: int | None = None,
     seed: int = 0,
     progress: Progress = silent,
-    builds: Builds | None = None,
 ) -> Measurement:
     """Measure the estimators at the task's theta, without the contacts and step derivatives of a diagnosis.
 
@@ -180,7 +170,6 @@ def measure(
         samples: see `diagnose_task`.
         seed: random seed.
         progress: called before each part.
-        builds: what `begin_programs` returned, if the programs have been begun.
     """
     task = simulator.task
     chosen = estimators_of(task)
@@ -190,7 +179,11 @@ def measure(
         return draw_batches(objective, task.theta, keys, oracles, count, slice(1))
 
     progress(0, 3, "programs")
-    (builds or begin_programs(simulator, contact)).wait()
+    builds = Builds()
+    for oracle in oracles:
+        blank = BlankObjective(**vars(objective), builds=builds)
+        getattr(blank, ORACLES[oracle].method)(task.theta, jax.random.split(jax.random.key(0), 1))
+    builds.wait()
     drawn(1)
     if samples is None:
         samples = affordable(sum(drawn(1)[1].values()), simulator.chunk_size)

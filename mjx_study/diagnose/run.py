@@ -4,7 +4,7 @@ import dataclasses
 from typing import Final
 
 from mjx_study.choices import is_file, takes_stiffness
-from mjx_study.diagnose.measurement import SAMPLES, begin_programs, chunk_of, estimators_of, measure
+from mjx_study.diagnose.measurement import SAMPLES, chunk_of, estimators_of, measure
 from mjx_study.diagnose.result import Diagnosis
 from mjx_study.diagnose.setting import setting_of, touches_of
 from mjx_study.experiment.memory import check_memory
@@ -64,10 +64,9 @@ def diagnose_task(
     def part(at: int) -> Progress:
         return lambda done, total, what: progress(at, 4, f"{PARTS[at]}: {what}") if what != "done" else None
 
-    simulator = Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES))
-    builds = begin_programs(simulator, cell.contact)  # compiled beside the check of derivatives
     derivatives = gradcheck(plan, part(1))
-    found = measure(simulator, cell.contact, samples, seed, part(2), builds)
+    simulator = Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES))
+    found = measure(simulator, cell.contact, samples, seed, part(2))
     progress(4, 4, "done")
     return Diagnosis(
         **vars(found),
