@@ -198,7 +198,8 @@ def _onset_rule(primals: Any, changes: Any) -> tuple[tuple[Qvel, Qvel], tuple[Qv
     of_model = dict(enumerate(structure.flatten_up_to(changes[0])))
     of_model = {place: each for place, each in of_model.items() if each is not None}
     moving = {place: jax.lax.stop_gradient(leaves[place]) for place in of_model}
-    spread, shift = _step_terms(*jax.lax.stop_gradient(primals[:3]), moving)
+    model, data, preceding = jax.lax.stop_gradient(primals[:3])
+    spread, shift = _step_terms(model, data, preceding, moving)
     change, change_before = (
         jnp.concatenate([each, ravel_pytree(of_model)[0]]) for each in instantiated(primals[3:], changes[3:])
     )
