@@ -7,7 +7,7 @@ over the strata.
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 from typing import Any, Final
 
@@ -23,6 +23,8 @@ MANY: Final = {"grid": 400, "strata": 400, "points": 200}
 FEW: Final = {"grid": 100, "strata": 100, "points": 50}
 AGREES, DIFFERS = 0.03, 0.1
 """Relative errors of the mean up to which it is called right, and from which wrong; in between it is unknown."""
+POINTS: Final = 0.9
+"""Share of the points at which a derivative must be that of differences for it to be called right there."""
 
 
 def measure(simulate: Simulate, scene: Scene, counts: Mapping[str, int], *, single: bool) -> dict[str, Any]:
@@ -92,32 +94,29 @@ def _on_grid(z: np.ndarray, values: np.ndarray, derivatives: np.ndarray, sigma: 
 
 
 def verdict(cell: Mapping[str, Any]) -> str:
-    """Return what one cell shows: right, biased (right at points alone), wrong, none, or unknown.
+    """Return what one cell shows.
 
-    Unknown also where the two ways to a slope or to a mean differ by too much to decide.
+    `right`, at points and on average; `biased`, right at points alone; `average`, right on average alone; `wrong`;
+    `none`, no derivatives; or `unknown`: nothing was measured, the two ways to the slope or to the mean differ by more
+    than `AGREES`, or the mean is off by an amount that does not decide.
     """
     if "error" in cell:
         return cell["verdict"]
-    if cell["nan_share"] > 0:
-        return "wrong"
-    scale = max(abs(cell["slope"]), 0.05 * math.hypot(cell["mean"], cell["sd"]), 1e-9)
-    unsure = max(
-        cell["slope_error"],
-        cell["mean_error"],
-        abs(cell["slope"] - cell["slope_by_differences"]),
-        abs(cell["mean"] - cell["mean_of_strata"]),
-    )
-    off = abs(cell["mean"] - cell["slope"])
-    if cell["point_share"] < 0.9:
-        return "wrong" if cell["point_error"] > 0.01 or cell["point_share"] < 0.5 else "unknown"
-    if off + unsure < DIFFERS * scale and off < max(AGREES * scale, unsure):
-        return "right"
-    return "biased" if off - unsure > DIFFERS * scale else "unknown"
+    slope, mean = cell["slope"], cell["mean"]
+    if not all(math.isfinite(cell[key]) for key in ("slope", "mean", "mean_of_strata", "point_error")):
+        return "unknown"
+    unsure = max(cell["slope_error"], abs(slope - cell["slope_by_differences"]))
+    vague = max(cell["mean_error"], abs(mean - cell["mean_of_strata"]))
+    if unsure > AGREES * abs(slope) or vague > AGREES * max(abs(mean), abs(slope)):
+        return "unknown"
+    off, scale = abs(mean - slope), max(abs(slope), 1e-9)
+    agrees, differs = off < AGREES * scale, off - unsure - vague > DIFFERS * scale
+    if cell["point_share"] >= POINTS:
+        return "right" if agrees else "biased" if differs else "unknown"
+    return "average" if agrees else "wrong" if differs else "unknown"
 
 
-def combined(cells: list[Mapping[str, Any]]) -> str:
-    """Return the verdict of a scene at all its steps: what accuses must be so at both, else it is unknown."""
+def combined(cells: Sequence[Mapping[str, Any]], steps: int) -> str:
+    """Return the verdict of a scene that all its cells share, at every one of so many timesteps; else unknown."""
     found = {verdict(cell) for cell in cells}
-    if len(found) == 1 and (len(cells) > 1 or "error" in cells[0]):
-        return found.pop()
-    return "wrong" if found == {"biased", "wrong"} else "unknown"
+    return found.pop() if len(found) == 1 and len(cells) == steps else "unknown"
