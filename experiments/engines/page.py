@@ -27,23 +27,23 @@ def cells(path: Path) -> Cells:
 
 def tables(found: Cells) -> dict[str, str]:
     """Return the page's tables: verdicts by engine and scene, and the numbers of each scene."""
-    matrix = [markdown_row("engine", *SHOWN), "|---" * (len(SHOWN) + 1) + "|"]
+    matrix = [markdown_row("engine", "differentiated in", *SHOWN), "|---" * (len(SHOWN) + 2) + "|"]
     for name, engine in ENGINES.items():
         rows = [[found[key] for step in TIMESTEPS if (key := (name, scene, step)) in found] for scene in SHOWN]
-        matrix.append(markdown_row(engine.label, *(combined(row, len(TIMESTEPS)) for row in rows)))
+        matrix.append(markdown_row(engine.label, engine.how, *(combined(row, len(TIMESTEPS)) for row in rows)))
     return {"matrix": "\n".join(matrix), **{scene: _numbers(found, scene) for scene in SHOWN}}
 
 
 def _numbers(found: Cells, scene: str) -> str:
     """Slope, mean of the derivatives and their error at points of one scene; engines without a cell are left out."""
     steps = " and ".join(f"{1000 * step:g}" for step in TIMESTEPS)
-    lines = [markdown_row("engine", f"slope, {steps} ms", "mean derivative", "right at points"), "|---|---|---|---|"]
+    lines = [markdown_row("engine", f"slope, {steps} ms", "E[FoBG]", "right at points"), "|---|---|---|---|"]
     for name, engine in ENGINES.items():
         row = [found.get((name, scene, step)) for step in TIMESTEPS]
         if any(row):
             lines.append(
                 markdown_row(
-                    f"{engine.label} ({engine.how})",
+                    engine.label,
                     ", ".join(_slope(cell) for cell in row),
                     ", ".join("-" if cell is None else f"{cell.get('mean', float('nan')):.3g}" for cell in row),
                     ", ".join("-" if cell is None else f"{cell.get('point_share', 0):.0%}" for cell in row),
