@@ -24,8 +24,10 @@ def test_exact_derivatives_of_a_toss_have_another_mean_than_the_slope(variant: s
     assert np.isclose(cell["slope"], cell["slope_by_differences"], rtol=0.1)
 
 
-RIGHT = dict.fromkeys(("slope", "slope_by_differences", "mean", "mean_of_strata", "point_share"), 1.0)
-RIGHT.update(dict.fromkeys(("slope_error", "mean_error", "point_error"), 0.0))
+RIGHT: dict[str, float] = {
+    **dict.fromkeys(("slope", "slope_by_differences", "mean", "mean_of_strata", "point_share"), 1.0),
+    **dict.fromkeys(("slope_error", "mean_error", "point_error"), 0.0),
+}
 
 
 @pytest.mark.parametrize(
