@@ -1,9 +1,9 @@
 """Learning to walk with each gradient: docs/robots.md's comparison, at equal samples and with tuned learning rates.
 
-    python -m experiments.learning tune walk zobg >> learning.jsonl    # the grid of learning rates and windows, 3 seeds each
-    python -m experiments.learning learn walk zobg >> learning.jsonl   # its best pair, 27 new seeds
-    python -m experiments.learning ppo walk >> learning.jsonl          # pip install stable-baselines3: tuned, then 10 seeds
-    python -m experiments.learning report learning.jsonl               # tables and figure
+    python -m experiments.learning tune walk zobg >> learning.jsonl                   # the grid, 3 seeds of each pair
+    python -m experiments.learning learn walk zobg learning.jsonl >> learning.jsonl   # its best pair, 12 new seeds
+    python -m experiments.learning ppo walk ppo 1e-3 0 >> learning.jsonl              # pip install stable-baselines3
+    python -m experiments.learning report learning.jsonl                              # tables, and docs/learning.png
 
 All descents of a method run in one program, on one device. An iteration takes `SAMPLES` rollouts, differentiated or
 not. The adjoint of first-order gradients is cut every few steps, as in analytic policy gradients.
@@ -11,6 +11,7 @@ not. The adjoint of first-order gradients is cut every few steps, as in analytic
 
 import dataclasses
 import json
+import math
 import sys
 import time
 from functools import partial
@@ -24,12 +25,19 @@ import mujoco
 import numpy as np
 import optax
 from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+from scipy import stats
 
 import mjx_study
 from estimators import Differentiation, Estimator, Evaluation, make_estimator, noise
 from estimators.sampling import draw
+from experiments import DOCS
+from experiments.figures.rollouts import INK
+from experiments.pages import DPI
 from mjx_study.objective.cost import before_each_step, last_of, rollout_cost
-from mjx_study.simulation.onset import as_row
+from mjx_study.plots.style import style_of
+from mjx_study.table import markdown_table
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Task
 
@@ -76,35 +84,36 @@ class Pieces:
         return self.task.policy.num_params
 
     def cost(self, theta, key, sign: float, onset: str, scored: bool):
-        """Cost of a rollout; its score or None, largest residual, and onset counts or None."""
+        """Cost of a rollout; its score or None, and its largest residual."""
         task = self.task
         start_key, noise_key = noise.split_sample_key(key)
         drawn = sign * task.sigma * noise.standard_noise(noise_key, task.policy.noise_shape, theta.dtype)
         pieces = PIECES[task.name]
         steps = task.horizon // pieces
-        piece = dataclasses.replace(
-            task, horizon=steps, policy=dataclasses.replace(task.policy, horizon=steps), final_cost=_none
-        )
+        policy: Any = task.policy
+        shorter = dataclasses.replace(policy, horizon=steps)
+        piece = dataclasses.replace(task, horizon=steps, policy=shorter, final_cost=_none)
         cut = jnp.arange(1, pieces + 1) % self.window == 0
 
         def advance(start, inputs):
             drawn, cut = inputs
-            cost, (states, _, residual, counts) = rollout_cost(piece, theta, None, start, drawn, onset)
+            cost, (states, _, residual, _) = rollout_cost(piece, theta, None, start, drawn, onset)
             score = None
             if scored:
                 score = task.policy.score(
                     theta, before_each_step(states), noise.noise_score(drawn, task.sigma, "gaussian")
                 )
             last = jax.tree.map(lambda leaf: jnp.where(cut, jax.lax.stop_gradient(leaf), leaf), last_of(states))
-            return last, (cost, score, residual, as_row(counts))
+            return last, (cost, score, residual)
 
         first = task.draw_start(start_key)
-        last, (costs, scores, residuals, counts) = jax.lax.scan(advance, first, (drawn.reshape(pieces, steps, -1), cut))
+        last, (costs, scores, residuals) = jax.lax.scan(advance, first, (drawn.reshape(pieces, steps, -1), cut))
         total = jnp.sum(costs) + task.costs()[1](last)
-        return total, (None if scores is None else jnp.sum(scores, axis=0), jnp.max(residuals), counts)
+        return total, (None if scores is None else jnp.sum(scores, axis=0), jnp.max(residuals))
 
     def _evaluate(self, theta, keys, sign: float) -> Evaluation:
-        value, (score, residual, _) = jax.vmap(lambda key: self.cost(theta, key, sign, "none", scored=True))(keys)
+        found: Any = jax.vmap(lambda key: self.cost(theta, key, sign, "none", scored=True))(keys)
+        value, (score, residual) = found
         return Evaluation(value, score, jnp.zeros_like(value), residual)
 
     def evaluate(self, theta, keys) -> Evaluation:
@@ -115,7 +124,7 @@ class Pieces:
 
     def differentiate(self, theta, keys, onset: str = "none") -> Differentiation:
         function = jax.value_and_grad(partial(self.cost, sign=1.0, onset=onset, scored=False), has_aux=True)
-        (value, (_, residual, counts)), gradient = jax.vmap(function, (None, 0))(theta, keys)
+        (value, (_, residual)), gradient = jax.vmap(function, (None, 0))(theta, keys)
         return Differentiation(value, gradient, residual)
 
     def differentiate_corrected(self, theta, keys) -> Differentiation:
@@ -197,7 +206,7 @@ def execute(task: Task, thetas: Float[np.ndarray, "policies params"], seconds: f
 
     def act(theta, qpos, qvel):
         state = mjx_study.State(qpos, qvel, jnp.zeros(0), jnp.zeros(host.nv))
-        control = task.policy.feedback(theta, state)
+        control: Any = task.policy.feedback(theta, state)
         return control, running_cost(state, control)
 
     act_all = jax.jit(jax.vmap(jax.vmap(act, (None, 0, 0))))
@@ -212,6 +221,15 @@ def execute(task: Task, thetas: Float[np.ndarray, "policies params"], seconds: f
                 mujoco.mj_step(host, data)
     distance = np.array([[data.qpos[0] for data in row] for row in datas]) - np.asarray(first.qpos)[:, 0]
     return total / seconds, distance
+
+
+def executed(task: Task, thetas: Float[np.ndarray, "policies params"]) -> dict[str, Any]:
+    """What policies do in the C engine, for the time that they were trained for and for four seconds."""
+    found = {}
+    for name, seconds in (("trained", task.horizon * task.scene.timestep), ("longer", 4.0)):
+        cost, distance = execute(task, thetas, seconds)
+        found |= {f"cost_{name}": cost.mean(axis=1), f"distance_{name}": distance.mean(axis=1)}
+    return found
 
 
 def grid(name: str, method: str) -> list[tuple[float, int]]:
@@ -236,7 +254,8 @@ def learn(name: str, method: str, rate: float, window: int) -> dict[str, Any]:
     task = make(name)
     settings = [(rate, window, 100 + seed) for seed in range(LEARN_SEEDS)]
     thetas, found = descend(task, method, settings)
-    return {"rate": rate, "window": window, "final": final_costs(task, thetas), **found, "theta": thetas}
+    kept = {name: each for name, each in found.items() if name != "alpha"} | {"alpha": np.nanmean(found["alpha"])}
+    return {"rate": rate, "window": window, "final": final_costs(task, thetas), **kept, **executed(task, thetas)}
 
 
 def proximal(name: str, rate: float, seed: int) -> dict[str, Any]:
@@ -246,7 +265,7 @@ def proximal(name: str, rate: float, seed: int) -> dict[str, Any]:
     task = make(name)
     theta, costs, seconds, built = train(task, rate, seed, ITERATIONS * SAMPLES * task.horizon)
     found = {"rate": rate, "seed": seed, "cost": costs, "seconds": seconds, "built": built}
-    return {**found, "final": final_costs(task, theta[None]), "theta": theta[None]}
+    return {**found, "final": final_costs(task, theta[None]), **executed(task, theta[None])}
 
 
 def best(lines: list[dict[str, Any]], name: str, method: str) -> tuple[float, int]:
@@ -254,6 +273,78 @@ def best(lines: list[dict[str, Any]], name: str, method: str) -> tuple[float, in
     wanted = "tune", name, method.removesuffix("_onset")
     (tuned,) = [line for line in lines if (line["what"], line["task"], line["method"]) == wanted]
     return tuned["pairs"][int(np.argmin(np.mean(tuned["final"], axis=1)))]
+
+
+HEADINGS: Final = (
+    "method",
+    "learning rate, window",
+    "seeds",
+    "cost",
+    "in C: cost per s",
+    "distance [m]",
+    "4 s in C: cost per s",
+    "distance [m]",
+)
+TICKS: Final = (0.15, 0.2, 0.3, 0.5, 1.0, 2.0)
+
+
+def figure(lines: list[dict[str, Any]], name: str) -> Figure:
+    """Mean cost with noise against rollouts and against seconds, with the range of the seeds' middle half."""
+    drawn = Figure(figsize=(9.0, 3.6), dpi=DPI, layout="constrained")
+    left, right = drawn.subplots(1, 2, sharey=True)
+    for method in [*METHODS, "ppo"]:
+        seeds = [each for each in lines if (each["task"], each["method"]) == (name, method) and each["what"] != "tune"]
+        seeds = [each for each in seeds if each.get("seed", 100) >= 100]
+        if not seeds:
+            continue
+        cost = np.concatenate([np.atleast_2d(each["cost"]) for each in seeds])
+        label, colour, _ = style_of({"zobg": "zobg_antithetic", "ivw_onset": "aobg_onset"}.get(method, method))
+        if method == "ppo":
+            label, colour = "PPO", INK
+        rollouts = np.arange(1, cost.shape[1] + 1) * SAMPLES * ITERATIONS / cost.shape[1]
+        times = np.mean([each["seconds"] for each in seeds], axis=0)
+        for axes, along in ((left, rollouts), (right, times)):
+            axes.plot(along, np.median(cost, axis=0), color=colour, label=label)
+            axes.fill_between(along, *np.quantile(cost, (0.25, 0.75), axis=0), color=colour, alpha=0.2, linewidth=0)
+    left.set(xlabel="rollouts", ylabel="cost of a batch", yscale="log", xticks=range(0, 20_001, 5_000))
+    left.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS], minor=False)
+    left.yaxis.set_minor_locator(NullLocator())
+    right.set(xlabel="seconds, with others beside on one GPU")
+    for axes in (left, right):
+        axes.grid(alpha=0.25, which="major")
+        axes.spines[["top", "right"]].set_visible(False)
+    left.legend(frameon=False, fontsize=8.5)
+    return drawn
+
+
+def table(lines: list[dict[str, Any]], name: str) -> str:
+    """Final costs of the new seeds, with 95 % intervals by Student's t, and what their policies do in the C engine."""
+    columns = ("final", "cost_trained", "distance_trained", "cost_longer", "distance_longer")
+    rows = []
+    for method in [*METHODS, "ppo"]:
+        seeds = [each for each in lines if (each["task"], each["method"]) == (name, method) and each["what"] != "tune"]
+        seeds = [each for each in seeds if each.get("seed", 100) >= 100]
+        if seeds:
+            numbers = [np.concatenate([np.ravel(each[column]) for each in seeds]) for column in columns]
+            window = f", {each} of {PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
+            chosen = f"{seeds[0]['rate']:.2g}{window}"
+            rows.append(
+                (f"`{method}`" if method != "ppo" else "PPO", chosen, len(numbers[0]), *map(_with_interval, numbers))
+            )
+    return markdown_table(rows, HEADINGS)
+
+
+def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:
+    half = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
+    return f"{np.mean(values):.3f} ± {half:.3f}"
+
+
+def report(path: str) -> None:
+    """Print a table for each task, and write the figure of the quadruped."""
+    lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
+    for name in dict.fromkeys(line["task"] for line in lines):
+        print(name, table(lines, name), sep="\n\n")
+    figure(lines, "walk").savefig(DOCS / "learning.png")
 
 
 def main(what: str, name: str, method: str, *arguments: str) -> None:
@@ -267,8 +358,8 @@ def main(what: str, name: str, method: str, *arguments: str) -> None:
             name, method, *map(json.loads, arguments)
         )
     line = {"what": what, "task": name, "method": method, **found}
-    print(json.dumps(line, default=lambda array: np.asarray(array, np.float32).tolist()))
+    print(json.dumps(line, default=lambda array: np.asarray(array).round(5).tolist()))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    report(sys.argv[2]) if sys.argv[1] == "report" else main(*sys.argv[1:])

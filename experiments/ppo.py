@@ -1,7 +1,9 @@
 """Proximal policy optimisation of a task by stable-baselines3: what people would do instead of `experiments.learning`.
 
-It sees the same starts, noise at its beginning, networks, costs and number of steps, and learns a value function beside.
+It has the same starts, initial noise, networks, costs and number of steps, and learns a value function beside.
 """
+
+# pyright: reportMissingImports=false
 
 import math
 import time
@@ -113,7 +115,7 @@ def train(task: Task, rate: float, seed: int, total: int) -> tuple[np.ndarray, S
     """Train with a learning rate on a number of steps.
 
     Returns:
-        theta; the mean cost of each round of rollouts, with noise; its end in seconds; and the seconds before the first.
+        theta; the mean cost of each round of rollouts, with noise; its end in seconds; and those before the first.
     """
     torch.set_num_threads(2)
     began = time.perf_counter()
