@@ -93,7 +93,8 @@ class Pieces:
         policy: Any = task.policy
         shorter = dataclasses.replace(policy, horizon=steps)
         piece = dataclasses.replace(task, horizon=steps, policy=shorter, final_cost=_none)
-        cut = jnp.arange(1, pieces + 1) % self.window == 0
+        ends = jnp.arange(1, pieces + 1)
+        cut = (ends % self.window == 0) & (ends < pieces)
 
         def advance(start, inputs):
             drawn, cut = inputs

@@ -18,9 +18,9 @@ def test_windows_cut_the_adjoint_and_nothing_else(monkeypatch: pytest.MonkeyPatc
     task = with_network(mjx_study.make_task("sliding_box", horizon=8), (3,), jax.random.key(1))
     task = task.replace(theta=task.theta + 0.3)
     monkeypatch.setitem(learning.PIECES, task.name, 4)
-    keys = jax.random.split(jax.random.key(0), 3)
-    whole = Simulator(task, chunk_size=3).objective(None).differentiate(task.theta, keys)
-    first_order = jax.jit(lambda window: learning.Pieces(task, window).differentiate(task.theta, keys))
+    keys = lambda: jax.random.split(jax.random.key(0), 3)  # noqa: E731
+    whole = Simulator(task, chunk_size=3).objective(None).differentiate(task.theta, keys())
+    first_order = jax.jit(lambda window: learning.Pieces(task, window).differentiate(task.theta, keys()))
     uncut, cut = first_order(4), first_order(1)
     np.testing.assert_allclose(uncut.value, whole.value, rtol=1e-9)
     np.testing.assert_allclose(uncut.gradient, whole.gradient, rtol=1e-7, atol=1e-9)
