@@ -69,7 +69,7 @@ def check_onset(onset: str) -> None:
         raise ValueError(unknown("onset", onset, ONSETS))
 
 
-def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 5"] | None:
+def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 6"] | None:
     """Stack the counts in one array, as stored in batches."""
     return None if counts is None else jnp.stack(jax.tree.leaves(counts), axis=-1).astype(float)
 
@@ -137,7 +137,7 @@ def _corrections(
     scene: Scene, model: mjx.Model, before: State, controls: Controls, course: Course, slots: int
 ) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
     """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero without events, and counts."""
-    events, missed = find_events(course, scene.timestep, slots)
+    events, without = find_events(course, scene.timestep, slots)
 
     def term(event: Events):
         pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
@@ -160,7 +160,7 @@ def _corrections(
     here, previous, strength, narrow, valid = terms
     empty = jnp.zeros((len(before.qpos), size, size), dtype)
     spread, shift = (empty.at[events.step].add(terms) for terms in (here, previous))
-    return spread, shift, events.counts(missed, valid, narrow, strength)
+    return spread, shift, events.counts(without, valid, narrow, strength)
 
 
 def onset_term(
