@@ -23,9 +23,9 @@ def main() -> None:
         for row, name in enumerate(names):
             cell = toss.get((name, "toss", step))
             ratio = cell["mean"] / cell["slope"] if cell else float("nan")
-            shown = 0 < ratio < 12 and cell is not None
+
             at = row + 0.4 * i - 0.2
-            if shown:
+            if cell and 0 < ratio < 12:
                 faint = 0.4 if verdict(cell) == "unknown" else 1.0
                 axes.barh(at, ratio, 0.38, color=f"C{i}", alpha=faint, label=f"{1000 * step:g} ms" if not row else None)
             else:
