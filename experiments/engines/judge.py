@@ -105,10 +105,10 @@ def verdict(cell: Mapping[str, Any]) -> str:
     slope, mean = cell["slope"], cell["mean"]
     if not all(math.isfinite(cell[key]) for key in ("slope", "mean", "mean_of_strata", "point_error")):
         return "unknown"
-    unsure = max(cell["slope_error"], abs(slope - cell["slope_by_differences"]))
-    vague = max(cell["mean_error"], abs(mean - cell["mean_of_strata"]))
+    unsure, vague = abs(slope - cell["slope_by_differences"]), abs(mean - cell["mean_of_strata"])
     if unsure > AGREES * abs(slope) or vague > AGREES * max(abs(mean), abs(slope)):
         return "unknown"
+    unsure, vague = max(unsure, cell["slope_error"]), max(vague, cell["mean_error"])
     off, scale = abs(mean - slope), max(abs(slope), 1e-9)
     agrees, differs = off < AGREES * scale, off - unsure - vague > DIFFERS * scale
     if cell["point_share"] >= POINTS:
