@@ -13,7 +13,7 @@ UV_VERSION := 0.13.8
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo figures study bench-first coverage test test-all test-newer-jax defects fuzz lint docs dist format lock clean
+.PHONY: help demo figures study bench-first coverage engines test test-all test-newer-jax defects fuzz lint docs dist format lock clean
 
 help: ## List the targets
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -52,6 +52,11 @@ bench-first: $(STAMP) ## Measure how long first answers take, into docs/performa
 
 coverage: $(STAMP) ## Measure the tables of docs/coverage.md (a few minutes)
 	$(BIN)/python -m experiments.coverage
+
+engines: $(STAMP) ## Measure what docs/engines.md lacks, in pinned environments (half an hour; resumable; QUICK=1 for a trial)
+	$(BIN)/python -m experiments.engines.install
+	$(BIN)/python -m experiments.engines $(if $(QUICK),--quick)
+	$(if $(QUICK),,$(BIN)/python -m experiments.engines page && $(BIN)/python -m experiments.engines.figure)
 
 test: $(STAMP) ## Run the tests except slow ones (PYTEST_ARGS='-k name' replaces the two workers)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

@@ -1,0 +1,76 @@
+"""The engines, the pinned packages of their environments, and how each is differentiated."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Final
+
+from experiments import ROOT
+
+HOME: Final = ROOT / "build" / "engines"
+"""Environments, one folder each; in none of them is this project installed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Environment:
+    """Packages of one environment.
+
+    Attributes:
+        packages: requirements of pip; empty for this project's own environment.
+        python: versions of Python that the packages' wheels exist for, the first that is found is taken.
+    """
+
+    packages: tuple[str, ...] = ()
+    python: tuple[str, ...] = ("3.11", "3.12")
+
+
+@dataclasses.dataclass(frozen=True)
+class Engine:
+    """A row of the matrix.
+
+    Attributes:
+        label: engine, version and variant, as readers know them.
+        environment: name in `ENVIRONMENTS`.
+        adapter: module in `adapters`, and variant.
+        how: way of differentiation, as the engine's documentation has it.
+        single: whether it computes in float32.
+        slow: whether rollouts are one at a time, so that fewer must do.
+    """
+
+    label: str
+    environment: str
+    adapter: str
+    variant: str
+    how: str
+    single: bool = False
+    slow: bool = False
+
+
+ENVIRONMENTS: Final = {
+    "own": Environment(),
+    "mujodico": Environment(("mujodico==3.17.0", "mujoco==4.0.0", "jax==0.10.2")),
+    "brax": Environment(("brax==0.14.2", "mujoco-mjx==3.17.0", "mujoco==4.0.0", "jax==0.10.2")),
+    "old_mjx": Environment(
+        ("mujoco-mjx==3.1.6", "mujoco==3.1.6", "jax==0.4.30", "jaxlib==0.4.30", "numpy<2", "scipy<1.13")
+    ),
+}
+ENGINES: Final = {
+    "mjx": Engine("MJX 3.17.0", "own", "mujoco_family", "forward", "forward mode, default solver"),
+    "mjx_reverse": Engine("MJX 3.17.0, iterations=1", "own", "mujoco_family", "reverse", "reverse mode"),
+    "mjx_study": Engine("mjx_study.step", "own", "mujoco_family", "plain", "reverse mode"),
+    "mjx_study_onset": Engine('mjx_study.step, onset="linear"', "own", "mujoco_family", "onset", "reverse mode"),
+    **{
+        f"mujodico_{law}": Engine(f"mujodico 3.17.0, {law}", "mujodico", "mujoco_family", law, "forward mode")
+        for law in ("hunt_crossley", "kelvin_voigt", "log_barrier", "conic")
+    },
+    **{
+        f"brax_{name}": Engine(f"brax 0.14.2, {name}", "brax", "brax_pipelines", name, "reverse mode")
+        for name in ("spring", "positional", "generalized")
+    },
+    "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode"),
+}
+
+
+def interpreter(engine: Engine) -> Path:
+    """Return where the Python of an engine's environment is, if it is installed."""
+    return Path(sys.executable) if engine.environment == "own" else HOME / engine.environment / "bin" / "python"

@@ -1,0 +1,35 @@
+"""Make the environments of the engines, of pinned packages, in build/engines: those named, or all.
+
+python -m experiments.engines.install [ENVIRONMENT ...]
+"""
+
+import shutil
+import subprocess
+import sys
+
+from experiments.engines.catalog import ENVIRONMENTS, HOME
+
+
+def install(name: str) -> bool:
+    """Make one environment, and return whether that succeeded; one that exists is brought to its pins."""
+    environment, folder = ENVIRONMENTS[name], HOME / name
+    python = next((path for version in environment.python if (path := shutil.which(f"python{version}"))), None)
+    if python is None:
+        print(f"{name}: needs Python {' or '.join(environment.python)}")
+        return False
+    if not (folder / "bin" / "pip").exists():
+        subprocess.run([python, "-m", "venv", folder], check=True)
+    pip = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    done = subprocess.run([*pip, *environment.packages], check=False).returncode == 0
+    print(f"{name}: {'installed' if done else 'FAILED'}", flush=True)
+    return done
+
+
+def main() -> None:
+    """Run the command line."""
+    names = sys.argv[1:] or [name for name, each in ENVIRONMENTS.items() if each.packages]
+    sys.exit(not all([install(name) for name in names]))
+
+
+if __name__ == "__main__":
+    main()

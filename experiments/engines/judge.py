@@ -1,0 +1,122 @@
+"""What is measured of a cell, an engine in a scene at a step, and what that shows.
+
+The slope of the mean cost comes from values alone, in two ways: by the score function on one grid, and by differences
+of the mean over strata of the noise (the same for both sides). So does the mean of the derivative: over the grid, and
+over the strata.
+"""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from statistics import NormalDist
+from typing import Any, Final
+
+import numpy as np
+
+from experiments.engines.scenes import Scene, Simulate
+
+REACH: Final = 5.0
+"""The grid's half width, in standard deviations."""
+SHIFT: Final = 0.2
+"""Shift of the parameter on each side in differences of the mean, in standard deviations."""
+MANY: Final = {"grid": 400, "strata": 400, "points": 200}
+FEW: Final = {"grid": 100, "strata": 100, "points": 50}
+AGREES, DIFFERS = 0.03, 0.1
+"""Relative errors of the mean up to which it is called right, and from which wrong; in between it is unknown."""
+POINTS: Final = 0.9
+"""Share of the points at which a derivative must be that of differences for it to be called right there."""
+
+
+def measure(simulate: Simulate, scene: Scene, counts: Mapping[str, int], *, single: bool) -> dict[str, Any]:
+    """Return the numbers of a cell.
+
+    Args:
+        counts: numbers of rollouts: of the `grid`, of `strata` (three times), of differences at `points` (twice).
+        single: whether the engine computes in float32, where differences need longer steps.
+    """
+    center, sigma = scene.center, scene.sigma
+    began = time.perf_counter()
+    first = simulate(np.array([center]))
+    compiled = time.perf_counter() - began
+    z = REACH * (2 * (np.arange(counts["grid"]) + 0.5) / counts["grid"] - 1)
+    began = time.perf_counter()
+    grid = simulate(center + sigma * z)
+    seconds = (time.perf_counter() - began) / len(z)
+    slope, mean, variance = _on_grid(z, grid.values, grid.derivatives, sigma)
+    coarse = _on_grid(z[::2], grid.values[::2], grid.derivatives[::2], sigma)
+    inverse, size = NormalDist().inv_cdf, counts["strata"]
+    strata = np.array([inverse((i + 0.5) / size) for i in range(size)])
+    below, middle, above = (simulate(center + sigma * (strata + shift)) for shift in (-SHIFT, 0, SHIFT))
+    difference = float(np.mean(above.values - below.values)) / (2 * SHIFT * sigma)
+    # Points at the middle of the noise, off the grid; a step of the differences that rounding allows.
+    thetas = center + sigma * np.array([inverse((i + 0.37) / counts["points"]) for i in range(counts["points"])])
+    reach = (2e-3 if single else 1e-5) * sigma
+    at = simulate(thetas)
+    lower, upper = simulate(thetas - reach), simulate(thetas + reach)
+    differences = (upper.values - lower.values) / (2 * reach)
+    scale = np.maximum(np.abs(differences), 0.01 * np.sqrt(np.nanmean(differences**2)) + 1e-12)
+    errors = np.abs(at.derivatives - differences) / scale
+    exact = None if scene.exact is None else float(first.positions[0, 0, 0] - scene.exact(np.array(center)))
+    nominal = len(thetas) // 2
+    return {
+        "slope": slope,
+        "slope_error": abs(slope - coarse[0]),
+        "slope_by_differences": difference,
+        "mean": mean,
+        "mean_error": abs(mean - coarse[1]),
+        "mean_of_strata": float(np.mean(middle.derivatives)),
+        "sd": math.sqrt(max(variance, 0)),
+        "point_error": float(np.median(errors)),
+        "point_share": float(np.mean(errors < (0.1 if single else 0.01))),
+        "nan_share": float(np.mean(~np.isfinite(at.derivatives))),
+        "zero_share": float(np.mean((at.derivatives == 0) & (np.abs(differences) > 1e-3 * np.abs(slope) + 1e-9))),
+        "seconds_per_gradient": seconds,
+        "seconds_to_start": compiled,
+        "state": first.positions[0].tolist(),
+        "state_error": exact,
+        "theta": center,
+        "value": float(first.values[0]),
+        "derivative": float(first.derivatives[0]),
+        "samples": [[float(each[nominal]) for each in (thetas, at.derivatives, differences)]],
+        "counts": dict(counts),
+        "single": single,
+    }
+
+
+def _on_grid(z: np.ndarray, values: np.ndarray, derivatives: np.ndarray, sigma: float) -> tuple[float, float, float]:
+    """Slope of the mean value, mean of the derivative and its variance, under normal noise."""
+    width = z[1] - z[0]
+    density = np.exp(-(z**2) / 2)
+    total = density.sum()
+    score = -np.diff(np.exp(-(np.append(z - width / 2, z[-1] + width / 2) ** 2) / 2)) / width
+    mean = density @ derivatives / total
+    return float(score @ values / total / sigma), float(mean), float(density @ (derivatives - mean) ** 2 / total)
+
+
+def verdict(cell: Mapping[str, Any]) -> str:
+    """Return what one cell shows.
+
+    `right`, at points and on average; `biased`, right at points alone; `average`, right on average alone; `wrong`;
+    `none`, no derivatives; or `unknown`: nothing was measured, the two ways to the slope or to the mean differ by more
+    than `AGREES`, or the mean is off by an amount that does not decide.
+    """
+    if "error" in cell:
+        return cell["verdict"]
+    slope, mean = cell["slope"], cell["mean"]
+    if not all(math.isfinite(cell[key]) for key in ("slope", "mean", "mean_of_strata", "point_error")):
+        return "unknown"
+    unsure, vague = abs(slope - cell["slope_by_differences"]), abs(mean - cell["mean_of_strata"])
+    if unsure > AGREES * abs(slope) or vague > AGREES * max(abs(mean), abs(slope)):
+        return "unknown"
+    unsure, vague = max(unsure, cell["slope_error"]), max(vague, cell["mean_error"])
+    off, scale = abs(mean - slope), max(abs(slope), 1e-9)
+    agrees, differs = off < AGREES * scale, off - unsure - vague > DIFFERS * scale
+    if cell["point_share"] >= POINTS:
+        return "right" if agrees else "biased" if differs else "unknown"
+    return "average" if agrees else "wrong" if differs else "unknown"
+
+
+def combined(cells: Sequence[Mapping[str, Any]], steps: int) -> str:
+    """Return the verdict of a scene that all its cells share, at every one of so many timesteps; else unknown."""
+    found = {verdict(cell) for cell in cells}
+    return found.pop() if len(found) == 1 and len(cells) == steps else "unknown"

@@ -1,0 +1,60 @@
+"""The tables of docs/engines.md, from data/engines.jsonl alone."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from experiments import DATA, DOCS
+from experiments.engines.catalog import ENGINES
+from experiments.engines.judge import combined
+from experiments.engines.scenes import TIMESTEPS
+from experiments.pages import markdown_row
+
+CELLS: Final = DATA / "engines.jsonl"
+PAGE: Final = DOCS / "engines.md"
+SHOWN: Final = ("toss", "ball_wall")
+"""Scenes that are measured and shown."""
+
+Cells = Mapping[tuple[str, str, float], Mapping[str, Any]]
+
+
+def cells(path: Path) -> Cells:
+    """Read cells by engine, scene and timestep; none if there is no file."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    return {(each["engine"], each["scene"], each["timestep"]): each for each in map(json.loads, lines)}
+
+
+def tables(found: Cells) -> dict[str, str]:
+    """Return the page's tables: verdicts by engine and scene, and the numbers of each scene."""
+    matrix = [markdown_row("engine", "differentiated in", *SHOWN), "|---" * (len(SHOWN) + 2) + "|"]
+    for name, engine in ENGINES.items():
+        rows = [[found[key] for step in TIMESTEPS if (key := (name, scene, step)) in found] for scene in SHOWN]
+        matrix.append(markdown_row(engine.label, engine.how, *(combined(row, len(TIMESTEPS)) for row in rows)))
+    return {"matrix": "\n".join(matrix), **{scene: _numbers(found, scene) for scene in SHOWN}}
+
+
+def _numbers(found: Cells, scene: str) -> str:
+    """Slope, mean of the derivatives and their error at points of one scene; engines without a cell are left out."""
+    steps = " and ".join(f"{1000 * step:g}" for step in TIMESTEPS)
+    lines = [markdown_row("engine", f"slope, {steps} ms", "E[FoBG]", "right at points"), "|---|---|---|---|"]
+    for name, engine in ENGINES.items():
+        row = [found.get((name, scene, step)) for step in TIMESTEPS]
+        if any(row):
+            lines.append(
+                markdown_row(
+                    engine.label,
+                    ", ".join(_slope(cell) for cell in row),
+                    ", ".join("-" if cell is None else f"{cell.get('mean', float('nan')):.3g}" for cell in row),
+                    ", ".join("-" if cell is None else f"{cell.get('point_share', 0):.0%}" for cell in row),
+                )
+            )
+    return "\n".join(lines)
+
+
+def _slope(cell: Mapping[str, Any] | None) -> str:
+    """Both ways to the slope where they differ in what is printed."""
+    if cell is None or "slope" not in cell:
+        return "-"
+    one, other = (f"{cell[key]:.3g}" for key in ("slope", "slope_by_differences"))
+    return one if abs(cell["slope"] - cell["slope_by_differences"]) < 0.01 * abs(cell["slope"]) else f"{one} or {other}"

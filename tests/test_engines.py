@@ -1,0 +1,60 @@
+"""Gradients of other engines: the cells that need no other environment, the verdicts, and the page."""
+
+import math
+
+import numpy as np
+import pytest
+
+from experiments.engines import catalog
+from experiments.engines.adapters import mujoco_family
+from experiments.engines.judge import combined, measure, verdict
+from experiments.engines.page import CELLS, PAGE, cells, tables
+from experiments.engines.scenes import SCENES
+from experiments.pages import replace_tables
+
+SMALL = {"grid": 100, "strata": 100, "points": 20}
+
+
+@pytest.mark.parametrize("variant", ["forward", "plain"])
+def test_exact_derivatives_of_a_toss_have_another_mean_than_the_slope(variant: str) -> None:
+    scene = SCENES["toss"]
+    cell = measure(mujoco_family.build(scene, 0.01, variant), scene, SMALL, single=False)
+    assert abs(cell["mean"] - cell["slope"]) > 0.5 * abs(cell["slope"])
+    assert cell["point_error"] < 1e-6 and cell["point_share"] == 1
+    assert np.isclose(cell["slope"], cell["slope_by_differences"], rtol=0.1)
+
+
+RIGHT: dict[str, float] = {
+    **dict.fromkeys(("slope", "slope_by_differences", "mean", "mean_of_strata", "point_share"), 1.0),
+    **dict.fromkeys(("slope_error", "mean_error", "point_error"), 0.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "right"),
+        ({"mean": 2.0, "mean_of_strata": 2.0}, "biased"),
+        ({"mean": 1.05, "mean_of_strata": 1.05}, "unknown"),
+        ({"point_share": 0.0}, "average"),
+        ({"point_share": 0.0, "mean": 2.0, "mean_of_strata": 2.0}, "wrong"),
+        ({"slope_by_differences": 1.04}, "unknown"),
+        ({"mean": 2.0, "mean_of_strata": 2.1}, "unknown"),
+        ({"mean": math.nan}, "unknown"),
+    ],
+)
+def test_verdicts(changes: dict[str, float], said: str) -> None:
+    assert verdict(RIGHT | changes) == said
+    assert combined([RIGHT | changes] * 2, 2) == said
+    assert combined([RIGHT | changes], 2) == "unknown"
+
+
+def test_the_page_says_what_the_data_give() -> None:
+    text = PAGE.read_text()
+    assert replace_tables(text, tables(cells(CELLS))) == text
+
+
+def test_environments_are_pinned_and_every_engine_has_one() -> None:
+    packages = [package for each in catalog.ENVIRONMENTS.values() for package in each.packages]
+    assert packages and all("==" in package or "<" in package for package in packages)
+    assert {engine.environment for engine in catalog.ENGINES.values()} == set(catalog.ENVIRONMENTS)
