@@ -105,7 +105,7 @@ def _as_single(config: StudyConfig, built: dict[str, Task]) -> StudyConfig:
 
 def _contact_models(config: StudyConfig, task: Task) -> Grid:
     """A task's contact models, and warnings about them; OptionError if there are none."""
-    models, found = family_grid(task, config.contact, config.stiffness, config.damping)
+    models, found = family_grid(task, config.contact, config.stiffness, config.damping, config.smoothing)
     if config.solref or config.solimp:
         more, also = solver_grid(task, config.solref, config.solimp)
         models, found = models + more, found + also
