@@ -293,6 +293,8 @@ def test_every_family_builds(name: str) -> None:
                 family_model(name, scene, effective_mass=mass, **given)
         return
     contact = family_model(name, scene, stiffness=100.0, effective_mass=mass)
+    if family.smoothing:  # another law: its stiffness is measured in test_law
+        return
     stiffness, damping = stiffness_from_solref(np.asarray(contact.solref).tolist(), effective_mass=mass)
     assert stiffness == pytest.approx(100.0, rel=1e-15)
     assert damping == pytest.approx(2 * family.dampratio * math.sqrt(100.0 * mass), abs=1e-12)

@@ -23,7 +23,7 @@ import dataclasses
 import functools
 import math
 from abc import ABC, abstractmethod
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -75,16 +75,20 @@ class Law(ABC):
         """Advance by one timestep; differentiable in both modes."""
 
 
-class LawModel(mjx.Model):
-    """A model with a contact law other than MuJoCo's."""
+if TYPE_CHECKING:
 
-    law: Law
+    class LawModel(mjx.Model):
+        """A model with a contact law other than MuJoCo's."""
+
+        law: Law
+
+else:  # made here, since checks at run time of a class statement's constructor would reject placeholders of JAX
+    LawModel = type("LawModel", (mjx.Model,), {"__annotations__": {"law": Law}, "__module__": __name__})
 
 
 def with_law(model: mjx.Model, law: Law) -> LawModel:
     """The model under a law."""
-    own = {field.name: getattr(model, field.name) for field in dataclasses.fields(mjx.Model)}
-    return LawModel(**own, law=law)
+    return LawModel(**vars(model), law=law)
 
 
 def make_law(name: str, smoothing: float) -> Law:
@@ -152,7 +156,7 @@ def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
 
 def _package(name: str) -> Any:
     try:
-        from mujodico import mjx as mujodico  # pyright: ignore[reportMissingImports]
+        from mujodico import mjx as mujodico
     except ImportError as error:
         raise ValueError(f"{name} {INSTALL} ({error})") from None
     return mujodico
