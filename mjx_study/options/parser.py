@@ -124,7 +124,9 @@ class Parser(argparse.ArgumentParser):
         """Add the contact models: one or many, with or without the analytic reference."""
         self.add_option("stiffness", many=many, unset=stiffness)
         self.add_option("contact", many=many, unset=contact, choices=CONTACTS if analytic else tuple(FAMILIES))
-        self.add_options("damping", "smoothing")
+        self.add_option("damping")
+        if analytic:  # studies, which read it
+            self.add_option("smoothing")
 
     def add_estimator_options(self) -> None:
         """Add the noise and the estimators' options; see `estimators.ESTIMATORS`."""
