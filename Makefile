@@ -25,7 +25,7 @@ figures: $(STAMP) ## Regenerate the smaller figures and the films of docs/
 	$(BIN)/mjx-study compare pusher --output results/pusher && cp results/pusher/comparison.png docs/pusher.png
 	$(BIN)/mjx-study landscape momentum_transfer --contact penalty,mujoco_default,smooth_onset --output results/onset
 	cp results/onset/landscape.png docs/onset.png
-	$(BIN)/mjx-study optimise pusher --contact penalty --stiffness 1000 --output results/optimisation
+	$(BIN)/mjx-study optimise pusher --contact penalty --stiffness 1000 --seeds 3 --output results/optimisation
 	cp results/optimisation/descent.png docs/optimisation.png
 	$(BIN)/python -m experiments.figures
 	$(BIN)/mjx-study rollout ball_wall --theta 0.75 --stiffness 1e4 --slow 2
@@ -37,10 +37,10 @@ FAMILIES := penalty,mujoco,mujoco_stiff
 ROBOTS := --contact penalty,mujoco,smooth_onset --samples 1000 --reference-samples 20000
 SWEEP := $(BIN)/mjx-study sweep
 study: $(STAMP) ## Sweep stiffness for the README's figures (half an hour; resumable)
-	$(SWEEP) pusher --contact $(FAMILIES) --stiffness 10:1e4:13:log --output results/variance
-	$(SWEEP) momentum_transfer --contact penalty,mujoco,smooth_onset --stiffness 1e3:1e5:5:log --reference-samples 3000 --output results/bias
-	$(SWEEP) gripper --stiffness 300,1000,3000 $(ROBOTS) --output results/bias_gripper
-	$(SWEEP) landing --stiffness 1e3,3e3,1e4 $(ROBOTS) --output results/bias_landing
+	$(SWEEP) pusher --contact $(FAMILIES) --stiffness 10:1e4:13:log --seeds 10 --output results/variance
+	$(SWEEP) momentum_transfer --contact penalty,mujoco,smooth_onset --stiffness 1e3:1e5:5:log --reference-samples 3000 --seeds 10 --output results/bias
+	$(SWEEP) gripper --stiffness 300,1000,3000 $(ROBOTS) --seeds 10 --output results/bias_gripper
+	$(SWEEP) landing --stiffness 1e3,3e3,1e4 $(ROBOTS) --seeds 10 --output results/bias_landing
 	$(SWEEP) pusher --contact $(FAMILIES) --stiffness 10:1e4:7:log --iterations 500 --samples 10 --seeds 5 --output results/achieved
 	$(SWEEP) pusher --contact $(FAMILIES) --stiffness 10:1e4:9:log --sigma 0.01:1:5:log --seeds 3 --output results/map
 	for figure in variance bias bias_gripper/bias bias_landing/bias achieved map/map_stiffness_sigma; do \

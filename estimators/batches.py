@@ -52,7 +52,7 @@ class Differentiation:
     value: Float[Array, " samples"]
     gradient: Float[Array, "samples params"]
     residual: Float[Array, " samples"] | None = None
-    events: Float[Array, "samples 5"] | None = None
+    events: Float[Array, "samples 6"] | None = None
 
 
 @register_pytree
@@ -97,7 +97,7 @@ class StepDifferentiation:
     noise_gradient: Float[Array, "samples steps controls"]
     policy_jacobian: Float[Array, "samples steps controls params"] | None
     residual: Float[Array, " samples"] | None = None
-    events: Float[Array, "samples 5"] | None = None
+    events: Float[Array, "samples 6"] | None = None
 
 
 @register_pytree

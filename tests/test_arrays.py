@@ -92,7 +92,7 @@ def test_a_cell_has_the_variables_of_its_study(changes: dict[str, Any], says: st
 def summary(rows: int = 6, params: int = 3) -> dict[str, Any]:
     rng = np.random.default_rng(0)
     moments = moments_of((rng.normal(size=(rows, params)),), 0, 1)
-    tally = Tally(np.array(1.0), np.array(0.0), np.array(0), np.zeros(8))
+    tally = Tally(np.array(1.0), np.array(0.0), np.array(0), np.zeros(9))
     return {"0.0": moments[0], "evaluation": tally}
 
 

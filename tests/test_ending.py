@@ -172,7 +172,7 @@ def test_a_full_disk_costs_a_study_nothing_that_was_there(
     def compute(plan: StudyPlan, cell: StudyCell) -> dict[str, np.ndarray]:
         if cell.samples == 8:
             full()
-        sizes = {"seed": plan.config.batches, "estimator": len(plan.config.estimators)}
+        sizes = {"seed": plan.config.seeds, "estimator": len(plan.config.estimators)}
         held = {name: each for name, each in GRADIENTS.items() if "param" not in each.dims}
         return {
             name: np.full([sizes[dim] for dim in each.dims], 9.0 if each.digits else 0.0) for name, each in held.items()

@@ -130,7 +130,9 @@ def test_an_array_of_an_impossible_shape(shape: str, tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_study_that_is_none(place: tuple[str, ...], value: Any, says: str, tmp_path: Path) -> None:
-    plan = plan_study(StudyConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0), contact=("penalty",)))
+    plan = plan_study(
+        StudyConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0), contact=("penalty",), seeds=10)
+    )
     document = json.loads(json.dumps(open_store(plan, tmp_path).document))
     assert read_document(sealed(document)) == document
     part = document

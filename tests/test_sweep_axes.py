@@ -23,7 +23,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells whose numbers say what they were computed with."""
 
     def compute(plan: StudyPlan, cell: StudyCell) -> dict[str, np.ndarray]:
-        seeds = plan.config.batches, len(plan.config.estimators)
+        seeds = plan.config.seeds, len(plan.config.estimators)
         own = {
             "residual": np.full(seeds[1], cell.model.stiffness),
             "unconverged": np.full(seeds[1], cell.sigma),

@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
     from mjx_study.experiment.study import StudyPlan
 
     def planned() -> StudyPlan:
-        return plan_study(StudyConfig(**study_fields(options), seeds=1))
+        return plan_study(StudyConfig(**study_fields(options)))
 
     lines = partial(gradient_lines, details=options.details)
     return run_one(options, planned, rows_as_json, lines, "figures and the numbers on disk")

@@ -58,6 +58,6 @@ def run(options: argparse.Namespace) -> int:
             raise OptionError("contact", f"{REFERENCE} is what --no-reference omits: omit one of them")
         if not options.no_reference and task.reference is not None and fields.get("onset", "none") == "none":
             fields["contact"] = tuple(dict.fromkeys((REFERENCE, *fields["contact"]))) if fields["contact"] else ()
-        return plan_study(StudyConfig(**fields, kind="landscapes", seeds=1), {options.task: task}, single=True)
+        return plan_study(StudyConfig(**fields, kind="landscapes"), {options.task: task}, single=True)
 
     return run_one(options, planned, curves, curve_lines, "a figure and the numbers")

@@ -43,7 +43,7 @@ def add(command: Parser) -> None:
     command.add_flag("--reference", "use the analytic reference instead of MJX")
     command.add_options("network", "estimators", "iterations")
     command.add_option("samples", many=False, unset=UNSET_TASK)
-    command.add_option("seeds", default=3, line="number of descents, each with independent noise")
+    command.add_option("seeds", line="number of descents, each with independent noise")
     command.add_options("optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule")
     command.add_estimator_options()
     command.add_backward_options(many=False)

@@ -155,7 +155,7 @@ def _sweep_head(plan: StudyPlan, missing: int) -> list[str]:
     )
     return [
         f"{', '.join(config.task_names)}: {plan.kind.describe(plan)}, "
-        f"{', '.join(config.estimator_names)}, seeds {config.batches}",
+        f"{', '.join(config.estimator_names)}, seeds {config.seeds}",
         f"contact models: {len(models)}, timestep {_listed(group.timestep for group in plan.groups)} s, "
         f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "
         f"sigma {_listed(cell.sigma for cell in plan.cells)}, {_listed(cell.samples for cell in plan.cells)} samples",

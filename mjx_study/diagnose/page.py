@@ -107,6 +107,9 @@ def _contact_lines(found: Diagnosis) -> list[str]:
             f"  step at which the first begins: standard deviation {found.onsets['onset_spread']:.2g}",
             f"  approach speed that a contact takes in its first step: {percent(found.onsets['onset_strength'])}",
         ]
+        for name, what in (("missed", "for lack of slots"), ("replaced", "since corners or edges replace others")):
+            if count := found.onsets.get(f"onsets_{name}", 0):
+                lines.append(f"  contacts per rollout without an onset term {what}: {count / found.samples:.2g}")
     if not found.touches:
         return [*lines, "  contacts that begin in the rollout without noise: 0"]
     worst = sorted(found.touches, key=lambda each: (each.stable, -each.jump, -each.travel))

@@ -87,8 +87,8 @@ class Descents(StudyKind):
         fixed = [each.name for each in chosen if hasattr(each, "sigma")]
         if config.sigma_schedule and fixed:
             raise OptionError("sigma_schedule", f"changes sigma, and {fixed[0]} holds for one: omit one of them")
-        history = HISTORY_NUMBERS * config.batches * recipe.iterations
-        check_memory(group.task, chosen, config.batches * cell.samples, other=history)
+        history = HISTORY_NUMBERS * config.seeds * recipe.iterations
+        check_memory(group.task, chosen, config.seeds * cell.samples, other=history)
         check_memory(group.task, (), plan.settings.evaluation_samples)
 
     def batches_at_once(self, config: StudyConfig) -> int:
@@ -103,9 +103,9 @@ class Descents(StudyKind):
     def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
         task, chosen = plan.task_of(cell), estimators_of(plan, cell)
         batches = [rollouts_of(each.needs, cell.samples, task) for each in chosen]
-        evaluations = (plan.config.batches * len(chosen) + 1) * plan.settings.evaluation_samples
+        evaluations = (plan.config.seeds * len(chosen) + 1) * plan.settings.evaluation_samples
         iterations = plan.groups[cell.group].descent.iterations
-        return plan.config.batches * iterations * np.sum(batches, axis=0) + [evaluations, 0]
+        return plan.config.seeds * iterations * np.sum(batches, axis=0) + [evaluations, 0]
 
     def computation(self, plan: StudyPlan) -> "DescentComputation":
         return DescentComputation(plan)
@@ -170,7 +170,7 @@ class Backend:
     def __init__(self, plan: StudyPlan, cell: StudyCell):
         group, config = plan.groups[cell.group], plan.config
         self.task, self.recipe, self.samples = group.task.replace(sigma=cell.sigma), group.descent, cell.samples
-        self.config, self.seeds = config, config.batches
+        self.config, self.seeds = config, config.seeds
         self.optimizer = make_optimizer(config.settings.optimizer, self.recipe.learning_rate, self.recipe.decay)
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
         evaluation = chunk_for(config.settings.evaluation_samples, local_devices(), [self.task])

@@ -90,17 +90,17 @@ class Gradients(StudyKind):
         if (blocks := blocks_of(plan, cell)) == 1:
             return plan.memory_of_seed(cell) * seeds_together(plan, cell)
         moments = bytes_of_moments(estimators_of(plan, cell), plan.task_of(cell).policy.num_params)
-        kept = plan.config.batches + math.ceil(math.log2(blocks))
+        kept = plan.config.seeds + math.ceil(math.log2(blocks))
         return block_of(plan, cell) * _bytes_in_block(plan, cell) + 2 * kept * moments
 
     def size(self, plan: StudyPlan, cell: StudyCell) -> int:
         parameters = plan.task_of(cell).policy.num_params
-        means = plan.config.batches * len(plan.config.estimators) * parameters
+        means = plan.config.seeds * len(plan.config.estimators) * parameters
         return super().size(plan, cell) - (8 * (means + parameters) if means > MOST_KEPT else 0)
 
     def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
         candidates = 0 if cell.model.analytic else CANDIDATES
-        batches = plan.config.batches * rollouts_of(plan.oracles, cell.samples, plan.task_of(cell))
+        batches = plan.config.seeds * rollouts_of(plan.oracles, cell.samples, plan.task_of(cell))
         return batches + [2 * plan.settings.reference_samples + candidates, candidates]
 
     def computation(self, plan: StudyPlan) -> "GradientComputation":
@@ -166,7 +166,7 @@ def _bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
 
 def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
     """Number of seeds that a cell draws at once: as many as fit into memory, in equal groups."""
-    batches = plan.config.batches
+    batches = plan.config.seeds
     fitting = max(1, int(AT_ONCE[jax.default_backend()] / plan.memory_of_seed(cell)))
     return math.ceil(batches / math.ceil(batches / fitting))
 
@@ -183,7 +183,7 @@ class GradientComputation(Computation):
 
     @property
     def _keys(self) -> dict[str, Any]:
-        return cell_keys(self._config.seed, self._config.batches)
+        return cell_keys(self._config.seed, self._config.seeds)
 
     def _keys_of_reference(self, index: int = 0) -> tuple[Key[Array, " pairs"], Key[Array, " samples"]]:
         """Keys of the pairs of a part of the reference, and of the candidates, which all parts share."""
@@ -197,7 +197,7 @@ class GradientComputation(Computation):
         if blocks == 1:
             return Work()
         with checkpoint.restored():
-            work = Blocks(self._config.batches, blocks, checkpoint.kept, partial(self._merged, cell))
+            work = Blocks(self._config.seeds, blocks, checkpoint.kept, partial(self._merged, cell))
             chosen = estimators_of(self._plan, cell)
             size = self._plan.task_of(cell).policy.num_params
             work.check([str(index) for index in range(len(chosen))], estimators.oracles_of(chosen), size)
@@ -252,7 +252,7 @@ class GradientComputation(Computation):
         """A cell's numbers from whole batches."""
         config, oracles, keys = self._config, self._plan.oracles, self._keys
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
-        tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(self._plan, cell)
+        tests, chosen = jax.random.split(keys["test"], config.seeds), estimators_of(self._plan, cell)
         together, each = seeds_together(self._plan, cell), self._seeds_of_statistics(cell)
         pad = partial(padded, size=self._plan.padded_samples(cell))
         reference: GradientEstimate | None = None
@@ -276,10 +276,10 @@ class GradientComputation(Computation):
             assert reference is not None
             numbers, tallies = zip(*(part.result() for part in parts), strict=True)
             joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *numbers)
-            found = cell_numbers(joined, reference, chosen, tallies, cell.samples * config.batches)
+            found = cell_numbers(joined, reference, chosen, tallies, cell.samples * config.seeds)
             return found | {"reference_pairs": np.array(float(pairs))}
 
-        for start in range(0, config.batches, together):
+        for start in range(0, config.seeds, together):
             some = slice(start, start + together)
             drawn = draw_batches(objective, theta, keys, oracles, cell.samples, some, device=self._device)
             if reference is None:
@@ -328,7 +328,7 @@ class GradientComputation(Computation):
             drawn = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((seeds, size, *leaf.shape[1:]), leaf.dtype), drawn)
             pilot = blank.evaluate(task.theta, jax.random.split(jax.random.key(0), min(cell.samples, PILOT)))
             reference = reference_of(task, blank, *self._keys_of_reference(), pilot, None)
-            keys = jax.random.split(self._keys["test"], config.batches)[:seeds]
+            keys = jax.random.split(self._keys["test"], config.seeds)[:seeds]
             types = drawn, type_of(np.asarray(size)), jax.tree.map(type_of, reference), type_of(keys)
             self._builds.start(seed_numbers(estimators_of(self._plan, cell), config.confidence), *types)
         self._builds.wait()

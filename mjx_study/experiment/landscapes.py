@@ -60,7 +60,7 @@ class Landscapes(StudyKind):
     def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
         task = plan.task_of(cell)
         exact = QUADRATURE if not cell.model.analytic and applies(task) else 0
-        return plan.settings.points * plan.config.batches * rollouts_of(plan.oracles, cell.samples, task) + exact
+        return plan.settings.points * plan.config.seeds * rollouts_of(plan.oracles, cell.samples, task) + exact
 
     def computation(self, plan: StudyPlan) -> "LandscapeComputation":
         return LandscapeComputation(plan)
@@ -99,7 +99,7 @@ class LandscapeComputation(Computation):
         plan, config, objective = self._plan, self._plan.config, self._objectives(cell)
         task, chosen = plan.task_of(cell), estimators_of(plan, cell)
         line = line_of(task, config.settings.points, config.span, config.direction, config.seed)
-        keys, columns, solved = cell_keys(config.seed, config.batches), [], []
+        keys, columns, solved = cell_keys(config.seed, config.seeds), [], []
         for theta in line.thetas(task.theta.dtype):
             drawn, _, residuals = draw_batches(objective, theta, keys, plan.oracles, cell.samples, slice(None))
             solved += residuals.values()

@@ -140,7 +140,7 @@ class StudyPlan:
     def fields(self) -> dict[str, Any]:
         """Fields of the configuration as a manifest holds them."""
         named = {"tasks": self.config.task_names, "estimators": self.config.estimator_names}
-        return self.config.resolved() | named | {"seeds": self.config.batches, "iterations": self.iterations}
+        return self.config.resolved() | named | {"iterations": self.iterations}
 
     @property
     def contents(self) -> dict[str, str]:
@@ -244,7 +244,7 @@ class StudyKind(StudyResults):
 
     def batches_at_once(self, config: StudyConfig) -> int:
         """Number of batches whose samples run in the same calls."""
-        return config.batches
+        return config.seeds
 
     def program_of(self, cell: StudyCell) -> Hashable:
         """Key of the compiled programs of a cell with MJX."""
@@ -256,7 +256,7 @@ class StudyKind(StudyResults):
 
     def memory(self, plan: StudyPlan, cell: StudyCell) -> int:
         """Memory held at once [bytes]: the batches and statistics of all seeds."""
-        return plan.memory_of_seed(cell) * plan.config.batches
+        return plan.memory_of_seed(cell) * plan.config.seeds
 
     def size(self, plan: StudyPlan, cell: StudyCell) -> int:
         """Size of a cell's arrays [bytes]."""

@@ -19,14 +19,14 @@ class Tally:
     seconds: np.ndarray  # computing time
     residual: np.ndarray  # the largest
     unconverged: np.ndarray  # number of rollouts
-    onsets: Float[np.ndarray, " eight"]  # see `_met`
+    onsets: Float[np.ndarray, " nine"]  # see `_met`
 
     @classmethod
     def of(cls, batch: Any, seconds: float, residuals: np.ndarray) -> "Tally":
         """Summarise a batch, given the residual of each of its rollouts."""
         largest = np.max(np.where(np.isfinite(residuals), residuals, np.inf), initial=0.0)
         events = getattr(batch, "events", None)
-        onsets = _met(np.zeros((0, 5)) if events is None else np.asarray(events, float).reshape(-1, 5))
+        onsets = _met(np.zeros((0, 6)) if events is None else np.asarray(events, float).reshape(-1, 6))
         return cls(np.array(seconds), np.asarray(largest), np.array(unconverged(residuals, precision())), onsets)
 
     @property
@@ -36,7 +36,7 @@ class Tally:
 
     def check(self) -> None:
         """Raise ValueError unless the arrays have their shapes, as those of a file may not."""
-        shapes = {"seconds": (), "residual": (), "unconverged": (), "onsets": (8,)}
+        shapes = {"seconds": (), "residual": (), "unconverged": (), "onsets": (9,)}
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape or getattr(self, name).dtype.kind not in "fiu":
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}")
@@ -56,14 +56,16 @@ def together(tallies: Iterable[Tally]) -> Tally:
     return reduce(Tally.merged, tallies)
 
 
-def _met(events: Float[np.ndarray, "rollouts five"]) -> Float[np.ndarray, " eight"]:
+def _met(events: Float[np.ndarray, "rollouts six"]) -> Float[np.ndarray, " nine"]:
     """Number of rollouts; of those with an onset: their number, sums of the three counts and of the squared strength,
-    and mean and summed squared deviation of the first onset's step."""
+    and mean and summed squared deviation of the first onset's step. Last, replaced points of all rollouts."""
     met = events[events[:, 0] > 0]
     first = met[:, 4]
     mean = np.mean(first) if len(met) else 0.0
     sums = np.sum(met[:, :3], axis=0)
-    return np.array([len(events), len(met), *sums, np.sum(met[:, 3] ** 2), mean, np.sum((first - mean) ** 2)])
+    return np.array(
+        [len(events), len(met), *sums, np.sum(met[:, 3] ** 2), mean, np.sum((first - mean) ** 2), np.sum(events[:, 5])]
+    )
 
 
 def _of_both(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -80,7 +82,7 @@ def onset_numbers(events: np.ndarray) -> np.ndarray:
 
 def numbers_of(onsets: np.ndarray) -> np.ndarray:
     """`ONSETS` from a tally's sums; NaN without an onset term."""
-    rollouts, met, *counts, squares, _, spread = onsets
+    rollouts, met, *counts, squares, _, spread, replaced = onsets
     if rollouts == 0:
-        return np.full(5, np.nan)
-    return np.array([*counts, *(np.sqrt(each / met) if met else np.nan for each in (squares, spread))])
+        return np.full(6, np.nan)
+    return np.array([*counts, *(np.sqrt(each / met) if met else np.nan for each in (squares, spread)), replaced])

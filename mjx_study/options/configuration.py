@@ -30,8 +30,6 @@ ASKED_BY: Final = {"descents": "iterations", "landscapes": "points"}
 """Options that ask for a kind of study where none is given."""
 NEEDED: Final = {"landscapes": "points"}
 """Options without which there is no such study."""
-SEEDS: Final = {"landscapes": 1}
-"""Number of seeds where it is not given, for kinds of study in which it is not 10."""
 SAMPLES: Final = 100
 """Samples per batch unless the configuration or a recipe sets another number."""
 AXES: Final = (
@@ -162,9 +160,7 @@ class StudyConfig:
         None, "N", "samples in each batch", "[3, 1e7]", unset=f"{SAMPLES}; of descents, the task's"
     )
     confidence: float = declared(0.95, "P", "confidence level of the intervals", "(0, 1)", study="gradients")
-    seeds: int | None = declared(
-        None, "N", "number of batches, or of descents", "[1, 100000]", unset="10; 1 for landscapes"
-    )
+    seeds: int = declared(1, "N", "number of batches, or of descents", "[1, 100000]")
     iterations: int | None = declared(
         None, "N", "iterations of the optimiser", "[1, 10000000]", study="descents", unset=UNSET_TASK
     )
@@ -324,11 +320,6 @@ class StudyConfig:
     def surrogate(self) -> bool:
         """Whether any contact model uses the derivatives of another."""
         return any(family != "none" for family in self.backward)
-
-    @property
-    def batches(self) -> int:
-        """Number of seeds, given or by default."""
-        return self.seeds or SEEDS.get(self.settings.kind, 10)
 
 
 OPTIONS: Final = options_of(StudyConfig)

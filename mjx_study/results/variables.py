@@ -83,6 +83,9 @@ GRADIENTS: Final = {
         EACH, "1", "share of the approach speed that an onset takes in a step, root mean square"
     ),
     "onset_spread": Variable(EACH, "1", "standard deviation of the step of a rollout's first onset"),
+    "onsets_replaced": Variable(
+        EACH, "1", "points of corners and edges that appear or vanish in contact, without a term", digits=0
+    ),
     "reference_norm": Variable((), "gradient", "norm of the reference gradient"),
     "reference_uncertainty": Variable((), "1", "standard error of the reference, over its norm"),
     "reference_effective_samples": Variable((), "1", "effective number of samples behind the reference's variance"),

@@ -71,6 +71,8 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
     counted = {
         "unconverged": "rollouts in which the contact solver did not converge",
         "onsets_missed": "onsets of contact have no term, since their rollouts have too many",
+        "onsets_replaced": "contact points of corners or edges appear or vanish in penetration and have no term: "
+        "means with the onset term may be off",
         "onsets_bounded": "onsets of contact are grazing, and their terms are bounded",
     }
     counts = {name: total(dataset[name]) for name in counted if name in dataset}

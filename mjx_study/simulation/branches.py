@@ -67,7 +67,7 @@ def jump_term(
         return total + final_cost(last)
 
     course = jax.vmap(lambda state, control: solved_step(scene, model, state, control)[-1])(before, controls)
-    events, missed = find_events(course, scene.timestep, slots)
+    events, without = find_events(course, scene.timestep, slots)
     filled = jnp.sum(events.used)
     weights = jnp.zeros((slots, 2, scene.host.nv), before.qpos.dtype)
     flags = jnp.zeros((slots, 2), bool)
@@ -86,7 +86,7 @@ def jump_term(
         before.qpos[at], states.qpos[at]
     )
     narrow, valid = flags.T
-    return jnp.sum(weights * moved), events.counts(missed, valid, narrow, jnp.zeros(slots, weights.dtype))
+    return jnp.sum(weights * moved), events.counts(without, valid, narrow, jnp.zeros(slots, weights.dtype))
 
 
 def _weights(

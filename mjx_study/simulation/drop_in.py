@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import unknown
@@ -21,7 +22,7 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qvel, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.native_step import solved_natively
-from mjx_study.simulation.onset import differentiated_once, onset_term, tangent_of, without_derivative
+from mjx_study.simulation.onset import Moving, differentiated_once, onset_term, tangent_of
 from mjx_study.simulation.patches import Place, patched
 from mjx_study.simulation.touch import Events, crossings, onset_begins
 
@@ -57,7 +58,7 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
         model: the model; its array leaves may be traced, batched under `jax.vmap` and differentiated.
         data: the state before the step, with controls and applied forces.
         onset: "none" or "linear"; "linear" makes derivatives account for a change of the step at which contact begins
-            or ends under force, and restricts them to qpos, qvel, act and ctrl (see `_corrected_step`).
+            or ends under force, and restricts them to first order (see `_corrected_step`).
 
     Returns:
         The state after the step, with every field that `mjx.step` fills in, of the type that it had before, so that a
@@ -65,7 +66,7 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
 
     Raises:
         ValueError: unknown onset, the onset term with RK4, or the model is not for MJX's JAX implementation.
-        TypeError: differentiation with respect to the model, or a second derivative, with the onset term.
+        TypeError: a second derivative with the onset term.
     """
     _check_onset(onset)
     if model.impl != mjx.Impl.JAX:
@@ -78,7 +79,7 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
         if onset == "none":
             following = _uncorrected_step(model, data)
         else:
-            preceding = _preceding_contact(model, data)
+            preceding = _preceding_contact(*jax.lax.stop_gradient((model, data)))
             following = jax.checkpoint(_corrected_step, policy=constraint.SAVE_SOLUTION)(model, data, preceding)
     return jax.tree.map(lambda new, old: new.astype(jax.typeof(old).dtype), following, data)
 
@@ -164,10 +165,9 @@ def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Preceding:
     After `mjx.forward` the rows are those of the state itself, and no contact is seen to end. The velocity before that
     step, which tells whether contact had just begun, is approximate where damping is integrated implicitly.
     """
-    known = jax.lax.stop_gradient(data)
-    before = known.qvel - model.opt.timestep * known.qacc
-    course = guards.course(model, known, before, known.qvel, known.qacc)
-    existed = (course.distance < 0) & (known.time > 0)
+    before = data.qvel - model.opt.timestep * data.qacc
+    course = guards.course(model, data, before, data.qvel, data.qacc)
+    existed = (course.distance < 0) & (data.time > 0)
     return Preceding(course, existed, existed & onset_begins(course.distance, model.opt.timestep * course.speed))
 
 
@@ -177,10 +177,9 @@ def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Preceding) -> m
     Delta_k replaces Delta_{k-1}, which the state does not contain: an error of order h in the term. No
     contact begins or ends at time 0, which no step precedes.
     """
-    model, timestep = without_derivative(model), model.opt.timestep
-    fixed = jax.lax.stop_gradient(data)
+    timestep, fixed = model.opt.timestep, jax.lax.stop_gradient(data)
     moved = difference_position(model, fixed.qpos, data.qpos)
-    moved_before = moved - timestep * (data.qvel - fixed.qvel)
+    moved_before = moved - tangent_of(timestep * data.qvel)
     earlier, later = _onset_change(model, fixed, preceding, moved, moved_before)
     shifted = integrate_position(model, fixed.qpos, earlier, timestep)
     after = mjx.step(model, data.replace(qpos=data.qpos + tangent_of(shifted), qvel=data.qvel + tangent_of(earlier)))
@@ -195,10 +194,16 @@ def _no_change(
 
 
 def _onset_rule(primals: Any, changes: Any) -> tuple[tuple[Qvel, Qvel], tuple[Qvel, Qvel]]:
-    spread, shift = _step_terms(*primals[:3])
-    change, change_before = instantiated(primals[3:], changes[3:])
-    value = _onset_change(*primals[:3], *differentiated_once(primals[3:]))
-    return value, (shift @ change_before, spread @ change)
+    leaves, structure = jax.tree.flatten(primals[0])
+    of_model = dict(enumerate(structure.flatten_up_to(changes[0])))
+    of_model = {place: each for place, each in of_model.items() if each is not None}
+    moving = {place: jax.lax.stop_gradient(leaves[place]) for place in of_model}
+    model, data, preceding = jax.lax.stop_gradient(primals[:3])
+    spread, shift = _step_terms(model, data, preceding, moving)
+    change, change_before = (
+        jnp.concatenate([each, ravel_pytree(of_model)[0]]) for each in instantiated(primals[3:], changes[3:])
+    )
+    return _onset_change(*differentiated_once(primals)), (shift @ change_before, spread @ change)
 
 
 _onset_change = with_rule(_no_change, _onset_rule)
@@ -206,12 +211,12 @@ _onset_change = with_rule(_no_change, _onset_rule)
 
 
 def _step_terms(
-    model: mjx.Model, data: mjx.Data, preceding: Preceding
-) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"]]:
-    """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins or ends."""
+    model: mjx.Model, data: mjx.Data, preceding: Preceding, moving: Moving
+) -> tuple[Float[Array, "nv changes"], Float[Array, "nv changes"]]:
+    """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins or ends; see `onset_term`."""
     positioned = fwd_position(model, data)
     here = guards.course(model, positioned, data.qvel, data.qvel, data.qacc)
-    empty = jnp.zeros((model.nv, model.nv), data.qvel.dtype)
+    empty = jnp.zeros((model.nv, model.nv + sum(leaf.size for leaf in moving.values())), data.qvel.dtype)
     if not here.distance.size:
         return empty, empty
     existed, active = preceding.existed, here.distance < 0
@@ -225,7 +230,7 @@ def _step_terms(
         guard = jnp.argmax(left)
         brief, others = ends[guard] & preceding.begun[guard], crossing.others(guard)
         event = Events(jnp.zeros((), int), guard, ends[guard], brief, *others, jnp.array(True))
-        parts = onset_term(model, data, states, data.ctrl[None], event)[:2]
+        parts = onset_term(model, data, states, data.ctrl[None], event, moving)[:2]
         return left.at[guard].set(False), *(total + part for total, part in zip(sums, parts, strict=True))
 
     # the loop over a batch ends with the last event of any sample

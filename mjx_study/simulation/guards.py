@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import ELLIPTIC, Qvel, Rows, Scalar, row_force
@@ -21,6 +21,7 @@ SKIN: Final = 1e-3
 """MJX's limit [m] on how much higher than the deepest corner of a convex geom another may be to touch a plane."""
 _PLANE: Final = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _CONVEX: Final = (int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_MESH))
+_EDGED: Final = (*_CONVEX, int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
 class Guards(NamedTuple):
@@ -86,6 +87,20 @@ def find_guards(model: mjx.Model, data: mjx.Data, qvel: Qvel, ends: bool | Bool[
     return Guards(distance, normals, jnp.zeros(len(members), bool).at[limits:].set(deep))
 
 
+class Points(NamedTuple):
+    """Contact points.
+
+    Attributes:
+        place: where each contact's point is [m].
+        reach: how far it can move in a step with the bodies [m], with a factor of two to spare.
+        geom: the two geoms of each contact.
+    """
+
+    place: Float[Array, "*steps contacts 3"]
+    reach: Float[Array, "*steps contacts"]
+    geom: Int[Array, "*steps contacts 2"]
+
+
 class Course(NamedTuple):
     """What guards do in a step, or in the steps of a rollout.
 
@@ -95,6 +110,7 @@ class Course(NamedTuple):
         room: distance of each guard whose rows may end in the step.
         leaving: its rate there with the velocity after the step, with which the step moves.
         pushes: whether its rows exert a force in the step.
+        points: contact points before the step; None unless a geom has corners or edges.
     """
 
     distance: Float[Array, "*steps guards"]
@@ -102,6 +118,7 @@ class Course(NamedTuple):
     room: Float[Array, "*steps guards"]
     leaving: Float[Array, "*steps guards"]
     pushes: Bool[Array, "*steps guards"]
+    points: Points | None
 
 
 def motion(
@@ -119,7 +136,23 @@ def course(model: mjx.Model, data: mjx.Data, qvel: Qvel, after: Qvel, qacc: Qvel
     rows: Any = data._impl
     force = jnp.abs(row_force(model, data, rows.efc_J @ qacc - rows.efc_aref))
     pushes = jnp.asarray(members, force.dtype) @ force > 0
-    return Course(*motion(model, data, qvel, ends=False), *motion(model, data, after, ends=True), pushes)
+    moves = motion(model, data, qvel, ends=False), motion(model, data, after, ends=True)
+    return Course(*moves[0], *moves[1], pushes, contact_points(model, data))
+
+
+def contact_points(model: mjx.Model, data: mjx.Data) -> Points | None:
+    """Contact points at the velocity of the state, after its forward kinematics; None unless a geom has corners."""
+    rows: Any = data._impl
+    contact = rows.contact
+    if not len(contact.dim) or not np.any(np.isin(np.asarray(model.geom_type), _EDGED)):
+        return None
+    bodies = jnp.asarray(model.geom_bodyid)[contact.geom]
+    turning, moving = jnp.split(data.cvel[bodies], 2, axis=-1)
+    arm = contact.pos[:, None] - data.subtree_com[jnp.asarray(model.body_rootid)[bodies]]
+    speed = jnp.linalg.norm(moving + jnp.cross(turning, arm), axis=-1).max(axis=-1)
+    size = jnp.asarray(model.geom_rbound)[contact.geom]
+    rolling = jnp.linalg.norm(turning, axis=-1).max(axis=-1) * jnp.where(size > 0, size, jnp.inf).min(axis=-1)
+    return Points(contact.pos, 2 * model.opt.timestep * (speed + rolling), contact.geom)
 
 
 def without(data: mjx.Data, members: Rows) -> mjx.Data:

@@ -30,10 +30,13 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 (arXiv 2306.06862), for the continuous-time limit.
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import ONSETS, unknown
@@ -49,6 +52,7 @@ from mjx_study.simulation.dynamics import (
     advance_velocity,
     entry_by_entry,
     force_stage,
+    fwd_position,
     simulated,
     solved_step,
     step_change,
@@ -69,7 +73,7 @@ def check_onset(onset: str) -> None:
         raise ValueError(unknown("onset", onset, ONSETS))
 
 
-def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 5"] | None:
+def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 6"] | None:
     """Stack the counts in one array, as stored in batches."""
     return None if counts is None else jnp.stack(jax.tree.leaves(counts), axis=-1).astype(float)
 
@@ -137,7 +141,7 @@ def _corrections(
     scene: Scene, model: mjx.Model, before: State, controls: Controls, course: Course, slots: int
 ) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
     """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero without events, and counts."""
-    events, missed = find_events(course, scene.timestep, slots)
+    events, without = find_events(course, scene.timestep, slots)
 
     def term(event: Events):
         pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
@@ -160,21 +164,32 @@ def _corrections(
     here, previous, strength, narrow, valid = terms
     empty = jnp.zeros((len(before.qpos), size, size), dtype)
     spread, shift = (empty.at[events.step].add(terms) for terms in (here, previous))
-    return spread, shift, events.counts(missed, valid, narrow, strength)
+    return spread, shift, events.counts(without, valid, narrow, strength)
+
+
+Moving = Mapping[int, Array]
+"""Leaves of a model that change, by their places in it."""
 
 
 def onset_term(
-    model: mjx.Model, template: mjx.Data, states: State, controls: Float[Array, "cases nu"], event: Events
-) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Scalar, Bool[Array, ""], Bool[Array, ""]]:
+    model: mjx.Model,
+    template: mjx.Data,
+    states: State,
+    controls: Float[Array, "cases nu"],
+    event: Events,
+    moving: Moving = MappingProxyType({}),
+) -> tuple[Float[Array, "nv changes"], Float[Array, "nv changes"], Scalar, Bool[Array, ""], Bool[Array, ""]]:
     """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, share of the approach speed lost, whether D was bounded, and
     whether the contact begins or ends by motion within the step; zeros and False otherwise.
 
-    Delta is v'(on) - v'(off) at first touch.
+    Delta is v'(on) - v'(off) at first touch, and n the derivative of the guard's distance over the nv coordinates, then
+    over the entries of the model's moving leaves.
 
     Args:
         template: everything but the position.
         states, controls: velocities and activations before steps k and k - 1, and their controls; or of k for both.
         event: the contact or limit, and whether it ends.
+        moving: leaves of the model that change.
     """
     touch = at_touch(model, template, states.qpos[0], states.qvel[0], event)
     positioned = touch.positioned
@@ -191,10 +206,24 @@ def onset_term(
     normal = guard.weights @ rows.efc_J
     cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
     last, before = touch.weights
-    here, previous = (jnp.outer(jump, normal) / cell for jump in (last * jumps[0], before * jumps[-1]))
+    slope = jnp.concatenate([normal, _slope_over(moving, model, positioned, states.qvel[0], event)])
+    here, previous = (jnp.outer(jump, slope) / cell for jump in (last * jumps[0], before * jumps[-1]))
     strength = -model.opt.timestep * (normal @ jumps[0]) / cell
     here, previous, strength = (jnp.where(valid, each, jnp.zeros_like(each)) for each in (here, previous, strength))
     return here, previous, strength, valid & (jnp.abs(touch.travel) < least), valid
+
+
+def _slope_over(
+    moving: Moving, model: mjx.Model, positioned: mjx.Data, qvel: Qvel, event: Events
+) -> Float[Array, " entries"]:
+    """Derivative of a guard's distance with respect to leaves of the model, at constant position."""
+    leaves, structure = jax.tree.flatten(model)
+
+    def distance(moving: Moving) -> Scalar:
+        moved = structure.unflatten([moving.get(place, leaf) for place, leaf in enumerate(leaves)])
+        return guards.motion(moved, fwd_position(moved, positioned), qvel, event.ends)[0][event.guard]
+
+    return ravel_pytree(jax.grad(distance)(dict(moving)))[0].astype(qvel.dtype)
 
 
 class GuardAtTouch(NamedTuple):

@@ -35,6 +35,8 @@ class OnsetCounts:
         strength: root-mean-square share of the approach speed that a corrected onset removes in one step; 0 if there is
             none, and with the jump, whose error does not depend on it.
         first: step of the first onset; NaN if there is none.
+        replaced: contact points of corners and edges that appear or vanish without their distance passing zero, for
+            which there is no term.
     """
 
     found: Int[Array, "*batch"]
@@ -42,12 +44,13 @@ class OnsetCounts:
     missed: Int[Array, "*batch"]
     strength: Float[Array, "*batch"]
     first: Float[Array, "*batch"]
+    replaced: Int[Array, "*batch"]
 
     @classmethod
     def none(cls, dtype: Any) -> "OnsetCounts":
         """Counts of a rollout without constraints."""
         zero = jnp.zeros((), int)
-        return cls(zero, zero, zero, jnp.zeros((), dtype), jnp.full((), jnp.nan, dtype))
+        return cls(zero, zero, zero, jnp.zeros((), dtype), jnp.full((), jnp.nan, dtype), zero)
 
 
 @register_pytree
@@ -73,19 +76,28 @@ class Events:
     used: Bool[Array, "*slots"]
 
     def counts(
-        self, missed: Int[Array, ""], valid: Flags, narrow: Flags, strength: Float[Array, " slots"]
+        self,
+        without: tuple[Int[Array, ""], Int[Array, ""]],
+        valid: Flags,
+        narrow: Flags,
+        strength: Float[Array, " slots"],
     ) -> OnsetCounts:
-        """Counts of a rollout, from the number of events without a slot and from what the term says of the others."""
+        """Counts of a rollout, from the numbers of events without a term and from what the term says of the others."""
+        missed, replaced = without
         begins = valid & ~self.ends
         onsets = jnp.sum(begins)
         first = jnp.min(jnp.where(begins, self.step.astype(strength.dtype), jnp.inf), initial=jnp.inf)
         first = jnp.where(jnp.isinf(first), jnp.nan, first)
         strength = jnp.sqrt(jnp.sum(jnp.where(begins, strength, 0.0) ** 2) / jnp.maximum(onsets, 1))
-        return OnsetCounts(onsets + missed, jnp.sum(narrow), missed, strength, first)
+        return OnsetCounts(onsets + missed, jnp.sum(narrow), missed, strength, first, replaced)
 
 
-def find_events(course: Course, timestep: float | Scalar, slots: int) -> tuple[Events, Int[Array, ""]]:
-    """Find where contacts and limits may begin, or end under force (`at_touch` says whether they do); count the rest.
+def find_events(
+    course: Course, timestep: float | Scalar, slots: int
+) -> tuple[Events, tuple[Int[Array, ""], Int[Array, ""]]]:
+    """Find where contacts and limits may begin, or end under force (`at_touch` says whether they do).
+
+    Also counts those without a slot, and replaced contact points.
 
     Args:
         course: what the guards do in each step.
@@ -104,7 +116,7 @@ def find_events(course: Course, timestep: float | Scalar, slots: int) -> tuple[E
     at_step = jax.tree.map(lambda leaf: leaf[step], crossing)
     absent, touching = jax.vmap(Crossings.others)(at_step, guard)
     events = Events(step, guard, ends[step, guard], brief[step, guard], absent, touching, used)
-    return events, jnp.sum(happens) - jnp.sum(used)
+    return events, (jnp.sum(happens) - jnp.sum(used), replaced_points(course, crossing))
 
 
 @register_pytree
@@ -145,6 +157,22 @@ def crossings(here: Course, preceding: Course, timestep: float | Scalar) -> Cros
     ends = ends & ~((here.distance < 0) & carried_on)
     begun = here.distance / jnp.where(begins, travel, 1.0)
     return Crossings(begins, ends, jnp.where(begins, begun, 1 + preceding.room / jnp.where(ends, leaves, 1.0)))
+
+
+def replaced_points(course: Course, crossing: Crossings) -> Int[Array, ""]:
+    """Number of contact points that appear or vanish where no guard passes zero; see `OnsetCounts`."""
+    if course.points is None:
+        return jnp.zeros((), int)
+    place, reach, geom = course.points
+    touching, pushes, begins, ends = (
+        each[:, -reach.shape[1] :] for each in (course.distance < 0, course.pushes, crossing.begins, crossing.ends)
+    )
+    same = jnp.all(geom[1:, :, None] == geom[:-1, None], axis=-1) & touching[1:, :, None] & touching[:-1, None]
+    moved = jnp.linalg.norm(place[1:, :, None] - place[:-1, None], axis=-1)
+    near = same & (moved <= jnp.maximum(reach[1:, :, None], reach[:-1, None]))
+    appear = touching[1:] & ~begins[1:] & ~jnp.any(near, axis=2)
+    vanish = touching[:-1] & pushes[:-1] & ~ends[1:] & ~jnp.any(near, axis=1)
+    return jnp.sum(appear) + jnp.sum(vanish)
 
 
 def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "*steps guards"]) -> Bool[Array, "..."]:
