@@ -271,6 +271,11 @@ def apply_contact(model: mjx.Model, contact: ContactModel | None) -> mjx.Model:
     return applied if contact is None or contact.law is None else with_law(applied, contact.law)
 
 
+def has_mujoco_law(contact: ContactModel | None) -> bool:
+    """Whether `mjx.step` and the C engine have the law of a contact model, None for the MJCF's."""
+    return contact is None or contact.law is None
+
+
 def apply_to_host(host: mujoco.MjModel, contact: ContactModel | None) -> None:
     """`apply_contact` to a host model, in place."""
     for name, value in _arrays_of(contact).items():
