@@ -1,7 +1,9 @@
-"""Contact laws beyond MuJoCo's: static load, derivatives, refusals."""
+"""Contact laws beyond MuJoCo's: static load, derivatives, what commands leave out for them, refusals."""
 
 import builtins
+import json
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,11 +13,15 @@ import numpy as np
 import pytest
 
 import mjx_study as study
+from mjx_study import cli
+from mjx_study.bench import plan_bench, run_bench
 from mjx_study.choices import laws_of
+from mjx_study.objective import rollout_cost
 from mjx_study.simulation.contact import apply_contact, cone_edges, effective_mass, family_model
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.law import LAWS
 from mjx_study.simulation.scene import Scene, put_scene
+from mjx_study.tasks import make_task
 
 BALL = """<mujoco><option timestep="0.002" cone="{}"/><worldbody><geom name="floor" type="plane" size="5 5 1"/>
   <body pos="0 0 0.1"><freejoint/><geom name="ball" size="0.1" mass="1"/></body></worldbody></mujoco>"""
@@ -85,6 +91,59 @@ def test_derivatives_are_those_of_differences_in_both_modes(law: str) -> None:
 def test_what_a_law_lacks_is_refused(law: str, given: dict[str, Any], cone: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         family_model(law, ball(cone), effective_mass=1.0, **given)
+
+
+def test_gradcheck_counts_what_has_no_counterpart(capsys: pytest.CaptureFixture[str]) -> None:
+    """Its own differences judge the derivative; the steps of mjx.step and the C engine are those of another law."""
+    law = ["momentum_transfer", "--contact", "hunt_crossley,mujoco", "--stiffness", "1000", "--states", "3"]
+    assert cli.main(["gradcheck", *law, "--horizon", "110", "--smoothing", "1e-4", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    own, usual = document["steps"]
+    assert own["stock_step"] is own["engine_step"] is own["engine"] is None and usual["stock_step"] < 1e-8
+    assert own["verdict"] == "right" and own["differences"] < 1e-6 and own["coverage"]["counts"]["push"]
+    (said,) = [warning for warning in document["warnings"] if "not compared" in warning]
+    assert said.startswith("hunt_crossley, K = 1000 N/m: 3 states not compared with mjx.step and the C engine")
+
+
+def test_bench_leaves_out_rivals_of_another_law() -> None:
+    defaults = study.StudyDefaults(stiffnesses=(100.0,), families=("hunt_crossley",))
+    report = run_bench(plan_bench(make_task("pusher", horizon=3).replace(defaults=defaults), 6))
+    assert report.contact.startswith("hunt_crossley") and set(report.ratios) == {
+        "gradient_per_value",
+        "onset_per_gradient",
+    }
+    assert any("left out" in line for line in report.lines())
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("gradcheck pusher --contact conic --stock", "--stock is for MuJoCo's law, which conic does not have"),
+        ("diagnose pusher --contact conic", "--contact describes contacts in the terms of MuJoCo's law"),
+        ("rollout pusher --contact mujoco --smoothing 1e-5", "--smoothing has no effect on MuJoCo's law"),
+        ("sweep pusher --contact conic --onset linear", "--onset is for MuJoCo's law"),
+    ],
+)
+def test_what_is_only_for_mujocos_law_is_refused(
+    command: str, message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(command.split()) == 2
+    printed = capsys.readouterr().err
+    assert message in printed and printed.count("\n") == 1, printed
+
+
+def test_forces_and_onsets_of_mujocos_law_are_refused() -> None:
+    task = make_task("pusher", horizon=3)
+    contact = family_model("conic", task.scene, effective_mass=1.0)
+    seen = study.observed(task.scene, study.initial_state(task.scene), contact, jnp.zeros(task.scene.host.nu))
+    with pytest.raises(ValueError, match="contact_force has forces of MuJoCo's law"):
+        seen.contact_force("pusher", "slider")
+    assert seen.xpos.shape == (task.scene.host.nbody, 3)  # what moves has no law
+    noise = jnp.zeros(task.policy.noise_shape)
+    for onset in ("linear", "jump"):
+        with pytest.raises(ValueError, match="the onset term is that of MuJoCo's law"):
+            rollout_cost(task, task.theta, contact, study.initial_state(task.scene), noise, onset)
 
 
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,7 +81,7 @@ class ObservedState(State):
     Raises:
         AttributeError: the scene has no such quantity.
         ValueError: without a control, a force or a sensor of forces or accelerations of a model with actuators; with
-            leading axes, or a contact law other than MuJoCo's, any force; or a sensor that the state does not determine.
+            leading axes, or a contact law other than MuJoCo's, any force; or a sensor that no state determines.
     """
 
     scene: Scene
