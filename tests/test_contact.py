@@ -292,7 +292,7 @@ def test_every_family_builds(name: str) -> None:
         np.testing.assert_array_equal(contact.solref, family.solref)
         for given in ({"stiffness": 1.0}, {"damping": 1.0}):
             with pytest.raises(ValueError, match="is a single point and takes no stiffness or damping"):
-                family_model(name, scene, effective_mass=mass, **given)
+                family_model(name, scene, effective_mass=mass, **given)  # type: ignore[arg-type]
         return
     contact = family_model(name, scene, stiffness=100.0, effective_mass=mass)
     if family.smoothing:  # another law: its stiffness is measured in test_law

@@ -95,23 +95,22 @@ def test_what_a_law_lacks_is_refused(law: str, given: dict[str, Any], cone: str,
 
 def test_gradcheck_counts_what_has_no_counterpart(capsys: pytest.CaptureFixture[str]) -> None:
     """Its own differences judge the derivative; the steps of mjx.step and the C engine are those of another law."""
-    law = ["momentum_transfer", "--contact", "hunt_crossley,mujoco", "--stiffness", "1000", "--states", "3"]
+    law = ["momentum_transfer", "--contact", "hunt_crossley", "--stiffness", "1000", "--states", "3"]
     assert cli.main(["gradcheck", *law, "--horizon", "110", "--smoothing", "1e-4", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    own, usual = document["steps"]
-    assert own["stock_step"] is own["engine_step"] is own["engine"] is None and usual["stock_step"] < 1e-8
+    (own,) = document["steps"]
+    assert own["stock_step"] is own["engine_step"] is own["engine"] is None
     assert own["verdict"] == "right" and own["differences"] < 1e-6 and own["coverage"]["counts"]["push"]
     (said,) = [warning for warning in document["warnings"] if "not compared" in warning]
     assert said.startswith("hunt_crossley, K = 1000 N/m: 3 states not compared with mjx.step and the C engine")
 
 
+@pytest.mark.slow
 def test_bench_leaves_out_rivals_of_another_law() -> None:
     defaults = study.StudyDefaults(stiffnesses=(100.0,), families=("hunt_crossley",))
     report = run_bench(plan_bench(make_task("pusher", horizon=3).replace(defaults=defaults), 6))
-    assert report.contact.startswith("hunt_crossley") and set(report.ratios) == {
-        "gradient_per_value",
-        "onset_per_gradient",
-    }
+    assert report.contact.startswith("hunt_crossley")
+    assert set(report.ratios) == {"gradient_per_value", "onset_per_gradient"}
     assert any("left out" in line for line in report.lines())
 
 
@@ -121,7 +120,8 @@ def test_bench_leaves_out_rivals_of_another_law() -> None:
         ("gradcheck pusher --contact conic --stock", "--stock is for MuJoCo's law, which conic does not have"),
         ("diagnose pusher --contact conic", "--contact describes contacts in the terms of MuJoCo's law"),
         ("rollout pusher --contact mujoco --smoothing 1e-5", "--smoothing has no effect on MuJoCo's law"),
-        ("sweep pusher --contact conic --onset linear", "--onset is for MuJoCo's law"),
+        ("sweep pusher --contact conic --onset linear --dry-run", "--onset is for MuJoCo's law"),
+        ("sweep pusher --contact mujoco,conic --estimators fobg_onset --dry-run", "corrects MuJoCo's law, not conic"),
     ],
 )
 def test_what_is_only_for_mujocos_law_is_refused(
