@@ -109,11 +109,12 @@ def split_sample_key(key: Key[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""
 
 
 def standard_noise(
-    noise_key: Key[Array, ""], shape: tuple[int, int], dtype, density: str = "gaussian"
+    noise_key: Key[Array, ""], shape: tuple[int, int], dtype, density: str = "gaussian", normal: Draw | None = None
 ) -> Float[Array, "steps dimensions"]:
-    """Draw unit-variance noise for a rollout, (steps, dimensions); policies scale it by sigma."""
-    flat = NOISES[density].draw(noise_key, (math.prod(shape),), dtype)  # the same bits, in long vectors
-    return flat.reshape(shape)
+    """Draw unit-variance noise for a rollout, (steps, dimensions), which policies scale by sigma; `normal` draws that
+    of the Gaussian."""
+    draw = normal if normal and density == "gaussian" else NOISES[density].draw
+    return draw(noise_key, (math.prod(shape),), dtype).reshape(shape)  # the same bits, in long vectors
 
 
 @partial(jax.jit, static_argnames=("shape", "density"))

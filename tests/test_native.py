@@ -16,7 +16,7 @@ from jax import lax
 
 from mjx_study import runtime
 from mjx_study.choices import TASK_DESCRIPTIONS
-from mjx_study.graph import build, c, native
+from mjx_study.graph import build, c, native, random
 from mjx_study.graph.function import capture
 from mjx_study.graph.native import SWITCH, native_identity
 from mjx_study.graph.nodes import ELEMENTWISE
@@ -52,6 +52,7 @@ FLOATS = {
     **{name: getattr(lax, name) for name in ("abs", "acos", "asin", "atan", "ceil", "cos", "cosh", "erf", "exp")},
     **{name: getattr(lax, name) for name in ("expm1", "floor", "is_finite", "log", "log1p", "logistic", "neg")},
     **{name: getattr(lax, name) for name in ("rsqrt", "sign", "sin", "sinh", "sqrt", "square", "tan", "tanh")},
+    "bitcast": lambda x: lax.bitcast_convert_type(x, f"uint{8 * x.dtype.itemsize}"),
     "round": lambda x: (lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), lax.round(x)),
     "integer_pow": lambda x: tuple(lax.integer_pow(x, y) for y in (-3, -1, 0, 1, 2, 5, 8)),
     "convert_element_type": lambda x: tuple(
@@ -99,7 +100,8 @@ def compare(function, *points, rtol=1e-12, exact=False):
 
 def test_every_operation_is_covered():
     others = {"not", "copysign"} - ELEMENTWISE
-    named = {*FLOATS, *PAIRS, *WHOLE} - {"of one", "one of three", "booleans"} | {"not"}
+    named = {*FLOATS, *PAIRS, *WHOLE} - {"of one", "one of three", "booleans"}
+    named |= {"not", "shift_left", "shift_right_logical"}
     assert ELEMENTWISE - named == set() and not others - {"copysign"}
 
 
@@ -122,6 +124,32 @@ def test_operations_of_two_floats(name):
         x, y = x[sizes < 1e15], y[sizes < 1e15]
     compare(PAIRS[name], x, y)
     compare(PAIRS[name], x.astype(jnp.float32), y.astype(jnp.float32), rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["uint64", "uint32", "uint16"])
+def test_shifts(kind):
+    most = np.iinfo(kind).max
+    shifts = lambda x: (x << np.dtype(kind).type(5), x >> np.dtype(kind).type(9), x + x)  # noqa: E731
+    compare(shifts, np.array([0, 1, 77, most // 3, most - 1, most], kind), exact=True)
+
+
+@pytest.mark.parametrize("size", [1, 6, 35, 400])
+def test_normal_random_numbers(size):
+    """Of the same keys as JAX's, to the rounding of XLA's polynomial, and the same in every batch."""
+    data = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(7), 500)))
+    ours, theirs = (
+        jax.jit(jax.vmap(lambda each, draw=draw: draw(jax.random.wrap_key_data(each), (size,), np.float64)))
+        for draw in (random.normal, jax.random.normal)
+    )
+    assert "native" in str(jax.make_jaxpr(ours)(data))
+    drawn = ours(data)
+    np.testing.assert_allclose(drawn, theirs(data), rtol=1e-13)
+    np.testing.assert_array_equal(ours(data[17:20]), drawn[17:20])
+
+
+def test_normal_random_numbers_of_the_tails():
+    x = np.concatenate([1 - np.geomspace(2.0**-53, 0.5, 200), np.linspace(-0.999, 0.999, 201)])
+    np.testing.assert_allclose(random._erf_inv(x), lax.erf_inv(x), rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", WHOLE)

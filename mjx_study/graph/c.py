@@ -292,6 +292,10 @@ class _Writer:
                 return first if node.dtype.kind == "u" else f"max_{kind}({first}, -{first})"
             case _ if name in _FUNCTIONS:
                 return f"{name}_{kind}({', '.join(values)})"
+            case "shift_left" | "shift_right_logical" if not isinstance(node.arguments[1], Node) and kind[0] == "u":
+                return f"{first} {'<<' if name == 'shift_left' else '>>'} {others[0]}"
+            case "bitcast_convert_type" if "mask" not in (kind, _type(of)):
+                return f"BITS({kind}, {first})"
             case "neg":
                 return f"-{first}"
             case "not":

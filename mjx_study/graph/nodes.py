@@ -34,8 +34,8 @@ _NUMPY: Final[dict[str, Callable[..., Any]]] = {
 }
 _OTHERS: Final = (
     *("acos", "asin", "atan", "atan2", "ceil", "clamp", "convert_element_type", "cos", "cosh", "div", "erf", "exp"),
-    *("expm1", "floor", "integer_pow", "log", "log1p", "logistic", "pow", "rem", "round", "rsqrt", "select_n", "sign"),
-    *("sin", "sinh", "tan", "tanh", "xor"),
+    *("expm1", "floor", "integer_pow", "log", "log1p", "logistic", "pow", "rem", "round", "rsqrt", "select_n"),
+    *("shift_left", "shift_right_logical", "sign", "sin", "sinh", "tan", "tanh", "xor"),
 )
 ELEMENTWISE: Final = frozenset((*_NUMPY, *_OTHERS))
 _COMMUTATIVE: Final = frozenset({"add", "add_any", "and", "eq", "max", "min", "mul", "ne", "or"})

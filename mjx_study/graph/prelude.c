@@ -48,6 +48,7 @@ typedef i32 mask;
 typedef i32_anywhere mask_anywhere;
 #endif
 #define AS(type, value) __builtin_convertvector(value, type)
+#define BITS(type, value) ((type)(value))
 #define MASK(comparison) AS(mask, comparison)
 #define ALL(type, constant) ((constant) - (type){0})
 

@@ -17,6 +17,7 @@ typedef unsigned char u8;
 typedef int mask;  // -1 or 0
 
 #define AS(type, value) ((type)(value))
+#define BITS(type, value) bits<type>(value)
 #define MASK(comparison) (-(mask)(comparison))
 #define ALL(type, constant) ((type)(constant))
 #define APART static __device__
@@ -25,6 +26,15 @@ typedef int mask;  // -1 or 0
 #define PASSED batch, lane, kept, step
 
 ONE int any(mask m) { return m; }
+
+template <typename to, typename from>
+ONE to bits(from value) {
+  union {
+    from old;
+    to same;
+  } both = {value};
+  return both.same;
+}
 
 #define SELECT(type) \
   ONE type select_##type(mask m, type no, type yes) { return m ? yes : no; }

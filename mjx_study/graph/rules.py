@@ -114,12 +114,19 @@ def _dot(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) 
     return [total.reshape(aval.shape)]
 
 
+@no_type_check
+def _reinterpreted(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
+    same = inputs[0].shape == aval.shape and aval.dtype != bool
+    return [graph.elementwise(lax.bitcast_convert_type_p, inputs, aval, **parameters)] if same else None
+
+
 RULES: Final[dict[str, Rule]] = {
     **ALGEBRA,
     **INDEXING,
     **dict.fromkeys(("squeeze", "reshape", "expand_dims"), lambda _, inputs, aval, __: [inputs[0].reshape(aval.shape)]),
     "argmax": _place_of_extreme(lax.gt_p),
     "argmin": _place_of_extreme(lax.lt_p),
+    "bitcast_convert_type": _reinterpreted,
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda _, inputs, __, parameters: [np.concatenate(inputs, parameters["dimension"])],
     "cumsum": _cumsum,

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from estimators.noise import split_sample_key, standard_noise
+from mjx_study.graph.random import normal
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
@@ -88,7 +89,8 @@ def simulate(
         noise_scale: factor of the noise; 0 for a zero-noise rollout.
     """
     start_key, noise_key = split_sample_key(key)
-    noise = noise_scale * task.sigma * standard_noise(noise_key, task.policy.noise_shape, theta.dtype, task.noise)
+    standard = standard_noise(noise_key, task.policy.noise_shape, theta.dtype, task.noise, normal)
+    noise = noise_scale * task.sigma * standard
     cost, (states, controls, residual, _) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
     return states, controls, cost, residual
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators.noise import noise_score, split_sample_key, standard_noise
+from mjx_study.graph.random import normal
 from mjx_study.objective.cost import before_each_step, derivative_model, last_of, rollout_cost
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.dynamics import State, step
@@ -40,7 +41,7 @@ class SamplePrograms:
         task = self.task
         start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
         dtype = task.scene.template.qpos.dtype
-        standard = standard_noise(noise_key, task.policy.noise_shape, dtype, task.noise)
+        standard = standard_noise(noise_key, task.policy.noise_shape, dtype, task.noise, normal)
         return task.draw_start(start_key), noise_scale * sigma * standard
 
     def cost(self, theta, contact, sigma, key_data, noise_scale, onset="none"):

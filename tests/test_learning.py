@@ -1,0 +1,42 @@
+"""The comparison of docs/robots.md: its gradients in windows, and its table."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import mjx_study
+from experiments import DATA, DOCS, learning
+from experiments.quadruped import walk
+from mjx_study.objective import Simulator
+from mjx_study.tasks.network import with_network
+
+
+def test_windows_cut_the_adjoint_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four pieces that are never cut give the gradient of a whole rollout, shorter windows another of the same cost."""
+    task = with_network(mjx_study.make_task("sliding_box", horizon=8), (3,), jax.random.key(1))
+    task = task.replace(theta=task.theta + 0.3)
+    monkeypatch.setitem(learning.PIECES, task.name, 4)
+    keys = lambda: jax.random.split(jax.random.key(0), 3)  # noqa: E731
+    whole = Simulator(task, chunk_size=3).objective(None).differentiate(task.theta, keys())
+    first_order = jax.jit(lambda window: learning.Pieces(task, window).differentiate(task.theta, keys()))
+    uncut, cut = first_order(4), first_order(1)
+    np.testing.assert_allclose(uncut.value, whole.value, rtol=1e-9)
+    np.testing.assert_allclose(uncut.gradient, whole.gradient, rtol=1e-7, atol=1e-9)
+    np.testing.assert_array_equal(cut.value, uncut.value)
+    assert np.max(np.abs(cut.gradient - uncut.gradient)) > 0.01 * np.max(np.abs(uncut.gradient))
+
+
+def test_the_page_has_the_table_of_the_data() -> None:
+    lines = [json.loads(line) for line in (DATA / "learning.jsonl").read_text().splitlines()]
+    assert learning.table(lines, "walk") in (DOCS / "robots.md").read_text()
+    assert learning.best(lines, "walk", "fobg_onset") == [0.005, 8.0]
+
+
+def test_a_quadruped_stands_in_the_c_engine() -> None:
+    """A network whose output is zero keeps the stance, at about the cost of standing still."""
+    task = walk(horizon=1)
+    cost, distance = learning.execute(task, np.asarray(task.theta)[None], seconds=0.4, starts=2)
+    assert cost.shape == distance.shape == (1, 2)
+    assert np.all((cost > 0.5) & (cost < 4.0)) and np.all(np.abs(distance) < 0.2)
