@@ -64,6 +64,8 @@ class Family:
         solimp: impedance of all members; None for the MJCF's.
         dampratio: damping ratio used with a stiffness if no damping is given.
         solref: fixed reference of a single point; None for families over stiffness or the MJCF's.
+        smoothing: default smoothing kappa of a law other than MuJoCo's, which has the name of the family; 0 for
+            MuJoCo's.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Family:
     solimp: tuple[float, float, float, float, float] | None
     dampratio: float = 0.0
     solref: tuple[float, float] | None = None
+    smoothing: float = 0.0
 
     @property
     def swept(self) -> bool:
@@ -96,9 +99,20 @@ FAMILIES: Final = {
             1.0,
         ),
         Family("mujoco_default", "MuJoCo's defaults: solref (0.02, 1)", DEFAULT_SOLIMP, 1.0, DEFAULT_SOLREF),
+        Family("hunt_crossley", "spring K whose damper grows with penetration", DEFAULT_SOLIMP, smoothing=1e-5),
+        Family("kelvin_voigt", "spring K and damper, critically damped; brakes early", DEFAULT_SOLIMP, 1.0, None, 1e-5),
+        Family(
+            "log_barrier", "rigid, with a force at a distance: a barrier", DEFAULT_SOLIMP, 1.0, DEFAULT_SOLREF, 1e-3
+        ),
+        Family("conic", "rigid: impulses complementary to velocities", DEFAULT_SOLIMP, 1.0, DEFAULT_SOLREF, 1e-5),
         Family("mjcf", "each contact as the MJCF has it", None),
     )
 }
+
+
+def laws_of(families: Iterable[str]) -> list[str]:
+    """Those contact families whose law is not MuJoCo's."""
+    return [family for family in families if family in FAMILIES and FAMILIES[family].smoothing]
 
 
 def takes_stiffness(families: Iterable[str]) -> bool:

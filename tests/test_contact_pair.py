@@ -112,12 +112,13 @@ def test_a_static_load_finds_the_stiffness(override: str, cone: str) -> None:
     scene = scene_of(host)
     pair, mass = contact_pair(scene, "floor", "ball"), effective_mass(scene, "ball", "floor")
     for name, family in {**FAMILIES, "mjcf": None}.items():
+        if family is not None and family.smoothing:  # other laws: test_law
+            continue
         if family is None:
             contact, solimp = None, pair.solimp
             stiffness = stiffness_from_solref(pair.solref.tolist(), effective_mass=mass)[0]
         else:
-            given = {"stiffness": STIFFNESS} if family.swept else {}
-            contact = family_model(name, scene, effective_mass=mass, **given)
+            contact = family_model(name, scene, effective_mass=mass, stiffness=STIFFNESS if family.swept else None)
             solimp = np.asarray(contact.solimp)
             solref = np.asarray(contact.solref).tolist()
             stiffness = STIFFNESS if family.swept else stiffness_from_solref(solref, effective_mass=mass)[0]

@@ -27,7 +27,7 @@ code 1 if a derivative is wrong.
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_contact_options(MIDDLE, many=False, analytic=False)
+    command.add_contact_options(MIDDLE, many=False, analytic=False, smoothing=False)
     command.add_option("samples", many=False, interval="[1, 1e7]", unset="500, or as many as fit into a minute")
 
 

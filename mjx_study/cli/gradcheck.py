@@ -34,9 +34,9 @@ Below the table, what the states exercise: contacts that push, stick, slide or s
 equalities. If the rollout does not reach one that the model has, faster states and random poses are searched.
 
 Exit code 0: every derivative that exists is right. 1: one is wrong, NaN, silently zero or unconverged, or the step
-differs from mjx.step or, for no documented reason, from the C engine. 3: right, but something that the model has and
-can reach was never exercised. Kinks and jumps are properties of the step, and differently placed contacts are not
-derivative errors: both are reported but do not fail.
+differs from mjx.step or, for no documented reason, from the C engine, which contact laws other than MuJoCo's are not
+compared with. 3: right, but something that the model has and can reach was never exercised. Kinks and jumps are
+properties of the step, and differently placed contacts are not derivative errors: both are reported but do not fail.
 
 With --mean: does an estimator's mean integrate to the difference of the mean cost along a path through theta? No
 reference gradient is needed. Exit code 0: all are right. 1: one is biased. 3: undecided. Columns:
@@ -93,7 +93,8 @@ def run(options: argparse.Namespace) -> int:
         )
     if options.mean:
         return _run_mean(options)
-    common = {"seed": options.seed or 0, "damping": options.damping, "stock": options.stock}
+    common = {"seed": options.seed or 0, "damping": options.damping}
+    common |= {"smoothing": options.smoothing, "stock": options.stock}
     common["states"] = options.states or CHECKED_STATES
     with usage_errors():
         configure_process(options)
@@ -123,7 +124,8 @@ def _run_mean(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         task = task_of(options).replace(onset=onset)
-        plan = plan_gradcheck(task, options.contact, options.stiffness, seed=seed, damping=options.damping)
+        given = {"damping": options.damping, "smoothing": options.smoothing}
+        plan = plan_gradcheck(task, options.contact, options.stiffness, seed=seed, **given)
         settings = {name: chosen[name] for name in REQUIRED_OPTIONS}
         found = make_estimators(names, settings | {"gamma": task.defaults.gamma}, task)
         reject_unread(names, given_options(options, *REQUIRED_OPTIONS))

@@ -32,7 +32,7 @@ from mjx_study.tasks.task import Task
 
 FILE_SECONDS: Final = 2.0
 """Duration of a file's rollout without --horizon [s]."""
-OF_TASKS: Final = ("contact", "stiffness", "damping", "noisy", "sigma", "theta", "model", "seed")
+OF_TASKS: Final = ("contact", "stiffness", "damping", "smoothing", "noisy", "sigma", "theta", "model", "seed")
 """Options that a file does not read."""
 MOST_BODIES_LISTED: Final = 12
 """Maximum number of bodies whose final positions are printed."""
@@ -98,7 +98,7 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
 def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
     theta, policy = theta_and_policy(options)
     found = {} if policy is None else policy.options
-    for name in ("contact", "stiffness", "damping", "timestep", *BUILDER_OPTIONS):
+    for name in ("contact", "stiffness", "damping", "smoothing", "timestep", *BUILDER_OPTIONS):
         if getattr(options, name) is None:
             setattr(options, name, found.get(name))
     task = task_of(options)
@@ -110,7 +110,7 @@ def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
         task = with_network(task, tuple(found["network"]), jax.random.key(0))  # theta replaces its weights
     if options.seed and not (options.noisy or task.random_start):
         raise OptionError("seed", "has an effect only with --noisy, as the initial state is fixed")
-    contact, messages = single_contact(task, options.contact, options.stiffness, options.damping)
+    contact, messages = single_contact(task, options.contact, options.stiffness, options.damping, options.smoothing)
     return partial(_simulate_task, at_theta(task, theta), contact, options.seed or 0, options.noisy), messages
 
 

@@ -73,7 +73,10 @@ def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
     from mjx_study.options.files import digest_of_json
 
     config, written = document["config"], []
-    kept = {name: config[name] for name in ("task", "stiffness", "damping", "cone", *BUILDER_OPTIONS, "network")}
+    kept = {
+        name: config[name]
+        for name in ("task", "stiffness", "damping", "smoothing", "cone", *BUILDER_OPTIONS, "network")
+    }
     kept |= {"contact": None if config["contact"] == REFERENCE else config["contact"]}
     kept |= {"timestep": config["timestep"][0] if config["timestep"] else None}
     for run in document["runs"]:

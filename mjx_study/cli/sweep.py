@@ -43,7 +43,9 @@ def add(command: Parser) -> None:
     choices = f"one or more of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
     command.add_argument("tasks", nargs="?", type=_tasks, metavar="TASK[,TASK]", help=choices)
     command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags take precedence")
-    command.add_options("contact", "stiffness", "damping", "solref", "solimp", "timestep", "cone", "sigma", "samples")
+    command.add_options(
+        "contact", "stiffness", "damping", "smoothing", "solref", "solimp", "timestep", "cone", "sigma", "samples"
+    )
     command.add_option("seeds", line="batches for each cell, or descents")
     command.add_options("estimators", "kind", "network", "confidence")
     command.add_option("iterations", line="optimise policies, N iterations", unset="")

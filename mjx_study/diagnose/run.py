@@ -10,7 +10,9 @@ from mjx_study.diagnose.setting import setting_of, touches_of
 from mjx_study.experiment.memory import check_memory
 from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
+from mjx_study.options.option import OptionError
 from mjx_study.progress import Progress, silent
+from mjx_study.simulation.contact import has_mujoco_law
 from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
@@ -50,6 +52,9 @@ def diagnose_task(
     """
     check_soundness(task)
     cell, warnings = single_contact(task, family, stiffness, damping)
+    if not has_mujoco_law(cell.contact):
+        what = f"describes contacts in the terms of MuJoCo's law, which {cell.family} does not have"
+        raise OptionError("contact", f"{what}: take compare and gradcheck")
     check_memory(task, estimators_of(task), samples or SAMPLES)
     progress(0, 4, PARTS[0])
     touches = tuple(touches_of(task, cell))

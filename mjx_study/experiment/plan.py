@@ -20,6 +20,7 @@ from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS, SAMPLES, N
 from mjx_study.options.option import OptionError
 from mjx_study.results.kind import find_kind
 from mjx_study.runtime import local_devices
+from mjx_study.simulation.contact import has_mujoco_law
 from mjx_study.tasks import TASKS, task_with_options
 from mjx_study.tasks.contact_grid import Grid, backward_grid, family_grid, single_defaults, solver_grid
 from mjx_study.tasks.network import with_network
@@ -87,6 +88,11 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
         corrected = [each.name for each in estimators_of(plan, cell) if "corrected" in each.needs]
         if config.surrogate and corrected:
             raise OptionError("backward", f"replaces the derivatives that {corrected[0]} corrects: omit one of them")
+        others = [each.family for each in groups[cell.group].models if not has_mujoco_law(each.contact)]
+        if corrected and others:
+            raise OptionError(
+                "estimators", f"with {corrected[0]} corrects MuJoCo's law, not {others[0]}: omit one of them"
+            )
         kind.check(plan, cell)
     grids = [(group.task, group.models) for group in groups]
     reject_unused_options(config, given, grids, first_order=kind.first_order)
@@ -105,7 +111,7 @@ def _as_single(config: StudyConfig, built: dict[str, Task]) -> StudyConfig:
 
 def _contact_models(config: StudyConfig, task: Task) -> Grid:
     """A task's contact models, and warnings about them; OptionError if there are none."""
-    models, found = family_grid(task, config.contact, config.stiffness, config.damping)
+    models, found = family_grid(task, config.contact, config.stiffness, config.damping, config.smoothing)
     if config.solref or config.solimp:
         more, also = solver_grid(task, config.solref, config.solimp)
         models, found = models + more, found + also

@@ -8,7 +8,7 @@ from typing import Final
 import jax.numpy as jnp
 import mujoco
 
-from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, takes_stiffness
+from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, laws_of, takes_stiffness
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
@@ -63,6 +63,7 @@ def plan_gradcheck(
     *,
     seed: int,
     damping: float | None = None,
+    smoothing: float | None = None,
     states: int = CHECKED_STATES,
     stock: bool = False,
 ) -> GradcheckPlan:
@@ -75,6 +76,7 @@ def plan_gradcheck(
             another range.
         seed: random seed of initial states, states and directions.
         damping: override of each family's damping [N s/m].
+        smoothing: override of the smoothing kappa of laws other than MuJoCo's [J].
         states: number of states per contact model, at least 1.
         stock: whether to check the derivative of `mjx.step` too.
 
@@ -86,10 +88,11 @@ def plan_gradcheck(
         families = ("mjcf",) if task.contact_pair is None else CONTACT
     own = task.defaults.stiffnesses
     usual = STIFFNESS if min(STIFFNESS) <= max(own) else own
-    cells, messages = family_grid(task, families, usual if stiffnesses is None else stiffnesses, damping)
+    cells, messages = family_grid(task, families, usual if stiffnesses is None else stiffnesses, damping, smoothing)
     if not cells:
         raise ValueError("no contact model to check: give at least one stiffness and one contact family")
-    reject_untaken(families, stiffness=stiffnesses, damping=damping)
+    reject_untaken(families, stiffness=stiffnesses, damping=damping, smoothing=smoothing)
+    _check_stock(families, stock)
     return GradcheckPlan(task, True, cells, messages, states, seed, stock)
 
 
@@ -101,6 +104,7 @@ def plan_scene_gradcheck(
     seed: int,
     pair: tuple[str, str] | None = None,
     damping: float | None = None,
+    smoothing: float | None = None,
     horizon: int = CHECKED_STEPS,
     states: int = CHECKED_STATES,
     stock: bool = False,
@@ -114,6 +118,7 @@ def plan_scene_gradcheck(
         seed: random seed of the states.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
         damping: override of each family's damping [N s/m].
+        smoothing: override of the smoothing kappa of laws other than MuJoCo's [J].
         horizon: number of steps of the rollout from which states are taken.
         states: number of states per contact model.
         stock: whether to check the derivative of `mjx.step` too.
@@ -123,7 +128,8 @@ def plan_scene_gradcheck(
     """
     if families is None:
         families = ("mjcf",) if stiffnesses is None else ("mujoco",)
-    reject_untaken(families, stiffness=stiffnesses, damping=damping)
+    reject_untaken(families, stiffness=stiffnesses, damping=damping, smoothing=smoothing)
+    _check_stock(families, stock)
     swept = takes_stiffness(families)
     if swept and stiffnesses is None:
         raise OptionError("stiffness", "must be given in N/m, along with {}, for a family that takes one", "pair")
@@ -133,8 +139,13 @@ def plan_scene_gradcheck(
         raise OptionError("pair", "is for a stiffness: give {}, or omit it", "stiffness")
     subject = scene_task(scene, horizon=horizon, pair=pair)
     _check(subject, states)
-    cells, messages = family_grid(subject, families, stiffnesses or (), damping)
+    cells, messages = family_grid(subject, families, stiffnesses or (), damping, smoothing)
     return GradcheckPlan(subject, False, cells, messages, states, seed, stock)
+
+
+def _check_stock(families: Sequence[str], stock: bool) -> None:
+    if stock and (laws := laws_of(families)):
+        raise OptionError("stock", f"is for MuJoCo's law, which {laws[0]} does not have: omit it")
 
 
 def _check(task: Task, states: int) -> None:
@@ -189,7 +200,7 @@ def gradcheck(plan: GradcheckPlan, progress: Progress = silent) -> GradcheckRepo
         costs=tuple(cost_checks),
         steps=tuple(step_checks),
         findings=tuple(sorted(findings, key=gravity)),
-        warnings=(*plan.warnings, *unoffered(task.scene.host)),
+        warnings=(*plan.warnings, *_uncompared(step_checks), *unoffered(task.scene.host)),
         environment=environment(),
     )
 
@@ -200,6 +211,16 @@ def _summary(plan: GradcheckPlan) -> str:
     parts += [plural(number, noun) for number, noun in ((host.na, "activation"), (host.nu, "control")) if number]
     taken = f"{plural(plan.states, 'state')} along {plural(plan.subject.horizon, 'step')} of {host.opt.timestep:g} s"
     return f"{', '.join(parts)}; {taken}"
+
+
+def _uncompared(checks: Sequence[StepCheck]) -> list[str]:
+    """Contact models whose step has no counterpart, with the number of states that were therefore not compared."""
+    return [
+        f"{check.label}: {plural(check.states, 'state')} not compared with mjx.step and the C engine, which have "
+        "MuJoCo's law; its own differences judge the derivatives"
+        for check in checks
+        if check.stock_step is None
+    ]
 
 
 def unoffered(host: mujoco.MjModel) -> list[str]:

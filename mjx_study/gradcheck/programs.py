@@ -20,7 +20,7 @@ from mjx_study.gradcheck.values import STAGES
 from mjx_study.identity import code_of
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.contact import ContactModel, has_mujoco_law
 from mjx_study.simulation.dynamics import State, exact_step, step
 from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.integration import difference_position
@@ -120,7 +120,8 @@ class Programs:
         for size in reversed(self._sizes):
             self.compiler.start(self._linear, point, _unit_rows(0, size), _unit_rows(0, outputs))
         self.compiler.start(self._exact, point, jnp.asarray(base.qpos), np.zeros((BATCH, inputs)))
-        self.compiler.start(self._stock_step, point)
+        if has_mujoco_law(case.contact):
+            self.compiler.start(self._stock_step, point)
         if stock:
             self.compiler.start(self._stock, point, _unit_rows(0, inputs))
 

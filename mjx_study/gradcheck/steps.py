@@ -16,7 +16,7 @@ from mjx_study.gradcheck.programs import ContactCase, Programs
 from mjx_study.gradcheck.report import Entry, Finding, StepCheck
 from mjx_study.gradcheck.states import Sample
 from mjx_study.gradcheck.values import EngineStep, Values, compare_values
-from mjx_study.simulation.contact import apply_contact
+from mjx_study.simulation.contact import apply_contact, has_mujoco_law
 from mjx_study.table import grouped
 from mjx_study.tasks.contact_grid import ContactPoint
 
@@ -33,6 +33,7 @@ class StateCheck:
         derivatives, judged: derivatives by mode (forward, reverse, tape or mjx.step), and verdicts on them.
         truth, engine_truth: finite differences of this project's step, and of the C engine's.
         modes: difference between reverse and forward mode where no jump excuses it.
+        values: comparison with `mjx.step` and the C engine; None for contact laws other than MuJoCo's, which they lack.
         engine: verdicts on the forward-mode derivative by `engine_truth`; None if the two steps differ.
     """
 
@@ -42,8 +43,8 @@ class StateCheck:
     truth: Differences
     judged: dict[str, Codes]
     modes: float
-    values: Values
-    engine_truth: Differences
+    values: Values | None
+    engine_truth: Differences | None
     engine: Codes | None
     context: FindingContext
 
@@ -70,11 +71,13 @@ def check_state(
     exact = programs.exact(case, solved, reference, ladder)
     noise = solution_noise(layout, exact.stages, qacc)
     truth = take_differences(exact.outputs, noise)
-    engine_truth = take_differences(
-        engine_step.outputs(solved, linear.qpos, ladder), engine_step.noise(solved, linear.qpos)
-    )
-    stock_step = programs.stock_step(case, solved)
-    values = compare_values(layout, engine_step, solved, exact.after, stock_step, exact.stages, noise)
+    values = engine_truth = None
+    if has_mujoco_law(case.contact):
+        engine_truth = take_differences(
+            engine_step.outputs(solved, linear.qpos, ladder), engine_step.noise(solved, linear.qpos)
+        )
+        stock_step = programs.stock_step(case, solved)
+        values = compare_values(layout, engine_step, solved, exact.after, stock_step, exact.stages, noise)
 
     model = apply_contact(layout.scene.model, case.contact)
     solref, solimp = np.asarray(model.geom_solref), np.asarray(model.geom_solimp)
@@ -96,7 +99,8 @@ def check_state(
         mode: judge(layout, jacobian, truth, converged, starved=starved, degenerate=degenerate)
         for mode, jacobian in derivatives.items()
     }
-    engine = judge(layout, linear.forward, engine_truth) if values.agrees_with_engine else None
+    agrees = values is not None and values.agrees_with_engine
+    engine = judge(layout, linear.forward, engine_truth) if agrees and engine_truth else None
     if engine is not None:
         judged = {mode: diagnosis.resolved_by(codes, engine) for mode, codes in judged.items()}
     if stock:
@@ -121,8 +125,9 @@ def step_check(
     engine = [
         worst_error(layout, check.derivatives["forward"], check.engine_truth, check.engine, range(len(layout.inputs)))
         for check in checks
-        if check.engine is not None
+        if check.engine is not None and check.engine_truth is not None
     ]
+    values = [check.values for check in checks if check.values is not None]
     stock = None
     if STOCK in checks[0].judged:
         nan = any((check.judged[STOCK] == NAN).any() for check in checks)
@@ -136,8 +141,8 @@ def step_check(
         modes=max(check.modes for check in checks),
         differences=worst("project", *(block for block in blocks if block != "contact")),
         parameters=worst("project", "contact") if len(layout.scales) else None,
-        stock_step=max(check.values.stock for check in checks),
-        engine_step=max(check.values.engine for check in checks),
+        stock_step=max((each.stock for each in values), default=None),
+        engine_step=max((each.engine for each in values), default=None),
         engine=max(engine, default=None),
         stock=stock,
         residual=max(check.residual for check in checks),
@@ -184,7 +189,7 @@ def _of_entries(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind,
 
 def _of_engine(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind, Entry]]:
     """Findings where the C engine's step has the same value but another derivative."""
-    if check.engine is None:
+    if check.engine is None or check.engine_truth is None:
         return
     apart = diagnosis.disagreements(check.judged["forward"], check.truth, check.engine, check.engine_truth)
     kind = ("project", VERDICTS[ENGINE], (), "the derivative is that of this step, but the C engine's step has another")
@@ -202,7 +207,7 @@ def _of_state(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind, E
         text = f"the two modes of differentiation disagree by {check.modes:.1e}"
         cause = f"{text}: {SINGULAR}" if check.context.singular else text
         yield ("project", "wrong", (), cause), check.entry("", check.modes)
-    if values.verdict:
+    if values is not None and values.verdict:
         who = STOCK if values.verdict == "value" and values.agrees_with_engine else "project"
         entry = check.entry(f"change of {layout.outputs[values.coordinate]}", *values.numbers)
         yield (who, values.verdict, (), values.cause), entry

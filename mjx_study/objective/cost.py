@@ -8,7 +8,7 @@ from estimators.noise import split_sample_key, standard_noise
 from mjx_study.graph.random import normal
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
-from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
 from mjx_study.simulation.dynamics import State, simulated, trajectory
 from mjx_study.simulation.onset import corrected_rollout, without_derivative
 from mjx_study.simulation.touch import OnsetCounts
@@ -47,6 +47,8 @@ def rollout_cost(
     backward = derivative_model(task, contact)
     if backward is not None and onset != "none":
         raise ValueError("the onset term requires exact derivatives: omit onset, or the contact's backward model")
+    if onset != "none" and not has_mujoco_law(contact):
+        raise ValueError("the onset term is that of MuJoCo's law: omit onset, or the contact's law")
     running_cost, final_cost = task.costs(contact)
     first = task.policy.place(theta, noise, start)
     moved, counts, term = (task.scene, model, first, control_law), None, 0.0

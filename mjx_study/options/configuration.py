@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Union, runtime_
 
 from estimators.choices import DENSITIES, suggestion
 from estimators.registry import ESTIMATORS, options_of_estimators
-from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS, takes_stiffness
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS, laws_of, takes_stiffness
 from mjx_study.options.numbers import MAX_VALUES
 from mjx_study.options.option import OptionError, Rows, declared, options_of
 
@@ -142,6 +142,9 @@ class StudyConfig:
         None, "K", "contact stiffness", "(0, inf)", unit="N/m", unset=UNSET_TASK
     )
     damping: float | None = declared(None, "B", "contact damping", "[0, inf)", unit="N s/m", unset="the family's")
+    smoothing: float | None = declared(
+        None, "KAPPA", "smoothing of laws other than MuJoCo's", "[0, inf)", unit="J", unset="the family's"
+    )
     solref: Rows = declared(
         (), "A;B", "contact models in MuJoCo's terms, every A with every B", "(-inf, inf)", read_rows=read_solref
     )
@@ -249,7 +252,8 @@ class StudyConfig:
         if self.theta is not None and len(self.tasks) > 1:
             raise OptionError("theta", "is for a single task: give one task, or omit it")
         if self.contact is not None:
-            reject_untaken(self.contact, stiffness=self.stiffness, damping=self.damping)
+            given = {name: getattr(self, name) for name in ("stiffness", "damping", "smoothing")}
+            reject_untaken(self.contact, **given)
         check_span(self.span)
         self._check_derivatives()
         self._check_kind()
@@ -340,8 +344,10 @@ def check_span(span: Sequence[float] | None) -> None:
         raise OptionError("span", "must be two numbers, the lower one first; got " + ", ".join(map(str, span)))
 
 
-def reject_untaken(families: Sequence[str], *, stiffness: object, damping: object) -> None:
-    """Raise OptionError for a stiffness or damping, not None, that none of the contact families takes."""
+def reject_untaken(families: Sequence[str], *, stiffness: object, damping: object, smoothing: object = None) -> None:
+    """Raise OptionError for a stiffness, damping or smoothing, not None, that none of the contact families takes."""
+    if smoothing is not None and not laws_of(families):
+        raise OptionError("smoothing", "has no effect on MuJoCo's law: omit it, or add a family such as hunt_crossley")
     undamped = [family for family in families if family != REFERENCE]
     for name, value, able in (("stiffness", stiffness, families), ("damping", damping, undamped)):
         if value is not None and not takes_stiffness(able):

@@ -16,7 +16,16 @@ from mjx_study.disk import read_bytes
 from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS
 from mjx_study.options.option import OptionError
 
-POLICY_OPTIONS: Final = ("contact", "stiffness", "damping", "timestep", "cone", "network", *BUILDER_OPTIONS)
+POLICY_OPTIONS: Final = (
+    "contact",
+    "stiffness",
+    "damping",
+    "smoothing",
+    "timestep",
+    "cone",
+    "network",
+    *BUILDER_OPTIONS,
+)
 """Options under which a policy was found."""
 
 

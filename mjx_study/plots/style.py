@@ -33,6 +33,10 @@ TITLES: Final = {
     "mujoco_stiff": "MuJoCo, impedance 0.99 to 0.9999",
     "smooth_onset": "smooth onset",
     "mujoco_default": "MuJoCo default",
+    "hunt_crossley": "Hunt-Crossley",
+    "kelvin_voigt": "Kelvin-Voigt",
+    "log_barrier": "log barrier",
+    "conic": "cone, rigid",
     "mjcf": "as in the MJCF",
     "reference": "analytic reference",
 }

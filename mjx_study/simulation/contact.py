@@ -35,6 +35,7 @@ from estimators.pytree import register_pytree
 from mjx_study.choices import DEFAULT_SOLIMP, FAMILIES, MAX_IMPEDANCE, MIN_IMPEDANCE, unknown
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact_pair import ContactPair, contact_pairs
+from mjx_study.simulation.law import Law, make_law, with_law
 from mjx_study.simulation.scene import Scene
 from mjx_study.table import percent
 
@@ -55,6 +56,7 @@ class ContactModel:
         margin: distance at which contact begins [m]; None keeps the MJCF's.
         backward: contact model whose derivatives replace this one's in a rollout (a surrogate gradient); None for exact
             derivatives.
+        law: contact law; None for MuJoCo's.
     """
 
     solref: Float[Array, "*batch 2"]
@@ -62,6 +64,7 @@ class ContactModel:
     friction: Float[Array, "*batch 3"] | None = None
     margin: Float[Array, "*batch"] | None = None
     backward: "ContactModel | None" = None
+    law: Law | None = None
 
 
 def contact_model(
@@ -106,7 +109,14 @@ def contact_model(
 
 
 def family_model(
-    name: str, scene: Scene, *, stiffness: float | None = None, damping: float | None = None, effective_mass: float
+    name: str,
+    scene: Scene,
+    *,
+    stiffness: float | None = None,
+    damping: float | None = None,
+    effective_mass: float,
+    smoothing: float | None = None,
+    edges: int = 1,
 ) -> ContactModel:
     """Create the member of a contact family with a given physical stiffness.
 
@@ -116,6 +126,8 @@ def family_model(
         stiffness: K [N/m], positive; None for single-point families.
         damping: B [N s/m], nonnegative; None for the family's damping ratio.
         effective_mass: effective mass of the contact along its normal [kg]; see `effective_mass`.
+        smoothing: kappa of a law other than MuJoCo's [J]; None for the family's.
+        edges: number of edges of the contact's cone, each a spring in laws other than MuJoCo's; see `cone_edges`.
 
     Raises:
         ValueError: unknown name, missing or superfluous stiffness, value out of range, or the family "mjcf", which has
@@ -128,10 +140,16 @@ def family_model(
         raise ValueError(f"contact family {name!r} is a single point and takes no stiffness or damping")
     if family.solimp is None:
         raise ValueError(f"contact family {name!r} keeps the model unchanged: use None instead of a contact model")
+    law = make_law(name, family.smoothing if smoothing is None else smoothing) if family.smoothing else None
+    if law is not None:
+        law.check(scene)
     if family.solref is not None:
-        return contact_model(family.solref, family.solimp, scene=scene)
+        return dataclasses.replace(contact_model(family.solref, family.solimp, scene=scene), law=law)
     if stiffness is None:
         raise ValueError(f"contact family {name!r} needs a stiffness in N/m")
+    if law is not None:
+        given = law.solref(stiffness, damping, effective_mass=effective_mass, d_width=family.solimp[1], edges=edges)
+        return dataclasses.replace(contact_model(given, family.solimp, scene=scene), law=law)
     solref = solref_from_stiffness(
         stiffness, damping, effective_mass=effective_mass, dampratio=family.dampratio if damping is None else None
     )
@@ -221,6 +239,13 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
     return 2 * (pair.condim - 1) * float(host.opt.impratio) / (2 * mu**2 * (1 + mu**2) * weight)
 
 
+def cone_edges(scene: Scene, geom1: str, geom2: str) -> int:
+    """Number of edges of the friction cone of two geoms' contact; 1 for elliptic and frictionless ones."""
+    condim = contact_pair(scene, geom1, geom2).condim
+    elliptic = scene.host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    return 1 if condim == 1 or elliptic else 2 * (condim - 1)
+
+
 def soften(contact: ContactModel, factor: float | Array) -> ContactModel:
     """Scale the stiffness of a contact model and its `backward` by a positive factor, at constant damping ratio."""
     first, second = contact.solref
@@ -242,7 +267,13 @@ def apply_contact(model: mjx.Model, contact: ContactModel | None) -> mjx.Model:
         leaf = getattr(model, name)
         return jnp.broadcast_to(value, leaf.shape).astype(jnp.result_type(leaf))
 
-    return model.replace(**{name: filled(name, value) for name, value in _arrays_of(contact).items()})
+    applied = model.replace(**{name: filled(name, value) for name, value in _arrays_of(contact).items()})
+    return applied if contact is None or contact.law is None else with_law(applied, contact.law)
+
+
+def has_mujoco_law(contact: ContactModel | None) -> bool:
+    """Whether `mjx.step` and the C engine have the law of a contact model, None for the MJCF's."""
+    return contact is None or contact.law is None
 
 
 def apply_to_host(host: mujoco.MjModel, contact: ContactModel | None) -> None:

@@ -43,6 +43,7 @@ from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
 from mjx_study.simulation.integration import integrate_position
+from mjx_study.simulation.law import LawModel
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
@@ -102,6 +103,10 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tupl
     Returns:
         The state after the step, and the solver's relative residual (see `constraint.residual`).
     """
+    if isinstance(model, LawModel):
+        following, qacc, residual = _step_of_law(scene, model, state, control)
+        qacc, residual = jax.lax.stop_gradient((qacc, residual))
+        return dataclasses.replace(following, warmstart=qacc), residual
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         advance = jax.checkpoint(entry_by_entry, static_argnums=0)
         return advance(partial(_runge_kutta, scene), model, state, control), jnp.zeros_like(state.qpos, shape=())
@@ -112,6 +117,8 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tupl
 
 def acceleration(scene: Scene, model: mjx.Model, state: State, control: Control) -> Qvel:
     """Constrained acceleration during a `step` [m/s^2 or rad/s^2], with its implicit derivative."""
+    if isinstance(model, LawModel):
+        return _step_of_law(scene, model, state, control)[1]
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:  # without constraints
         return smooth_stages(scene, model, state, control).qacc_smooth
     return _differentiable_step(scene, model, state, control)[0].warmstart
@@ -122,9 +129,16 @@ def exact_step(scene: Scene, model: mjx.Model, state: State, control: Control) -
 
     For finite differences, which would otherwise reflect where the solver of `step` stopped.
     """
-    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+    if isinstance(model, LawModel) or scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return *step(scene, model, state, control), smooth_stages(scene, model, state, control)
     return _solved(constraint.solve_to_rounding, scene, model, state, control)
+
+
+def _step_of_law(scene: Scene, model: LawModel, state: State, control: Control) -> tuple[State, Qvel, Scalar]:
+    """`step` under another law than MuJoCo's, and the acceleration in it, with its derivative."""
+    advance = jax.checkpoint(lambda model, *point: model.law.step(scene, model, *point))
+    qpos, qvel, act, qacc, residual = advance(model, state.qpos, state.qvel, state.act, control)
+    return State(qpos, qvel, act, qacc), qacc, residual
 
 
 def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Control) -> mjx.Data:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from estimators.choices import suggestion
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
 from mjx_study.simulation.dynamics import Act, Control, Qpos, State, acceleration, entry_by_entry, smooth_stages
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
@@ -81,7 +81,7 @@ class ObservedState(State):
     Raises:
         AttributeError: the scene has no such quantity.
         ValueError: without a control, a force or a sensor of forces or accelerations of a model with actuators; with
-            leading axes, any force; or a sensor that the state does not determine.
+            leading axes, or a contact law other than MuJoCo's, any force; or a sensor that no state determines.
     """
 
     scene: Scene
@@ -141,6 +141,10 @@ class ObservedState(State):
             raise ValueError(
                 f"{what} depends on the control, which only the running_cost is given: ask for it there, or for "
                 "positions and velocities here"
+            )
+        if needed and not has_mujoco_law(self.contact):
+            raise ValueError(
+                f"{what} has forces of MuJoCo's law: it is unknown for another, ask for what moves instead"
             )
         control = jnp.zeros(host.nu, self.qpos.dtype) if control is None else control
         model = apply_contact(self.scene.model, self.contact)

@@ -9,13 +9,14 @@ from contextlib import contextmanager
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, REFERENCE, takes_stiffness
+from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, REFERENCE, laws_of, takes_stiffness
 from mjx_study.limits import MOST_MODELS, check_count
 from mjx_study.options.configuration import reject_untaken
 from mjx_study.options.option import OptionError
 from mjx_study.simulation.contact import (
     ContactModel,
     ContactWarning,
+    cone_edges,
     contact_model,
     contact_pair,
     family_model,
@@ -66,6 +67,7 @@ def family_grid(
     families: Sequence[str] | None = None,
     stiffnesses: Sequence[float] | None = None,
     damping: float | None = None,
+    smoothing: float | None = None,
 ) -> Grid:
     """Return the contact models of a sweep, family by family.
 
@@ -74,6 +76,7 @@ def family_grid(
         families: names of contact families; "reference" for the analytic system.
         stiffnesses: stiffnesses for families that take one [N/m].
         damping: override of each family's damping [N s/m].
+        smoothing: override of the smoothing kappa of laws other than MuJoCo's [J].
     """
     points, messages = [], []
     stiffnesses = task.defaults.stiffnesses if stiffnesses is None else stiffnesses
@@ -89,22 +92,26 @@ def family_grid(
         swept = family not in FAMILIES or FAMILIES[family].swept
         for stiffness in stiffnesses if swept else (None,):
             with _warnings_of_contact() as caught:
-                contact = None if family == "mjcf" else _contact(task, family, stiffness, damping)
+                contact = None if family == "mjcf" else _contact(task, family, stiffness, damping, smoothing)
                 points.append(ContactPoint(family, stiffness or _stiffness(task, contact), contact, digits))
             messages += [f"{points[-1].label}: {warning.message}" for warning in caught]
     return tuple(points), tuple(messages)
 
 
 def single_contact(
-    task: Task, family: str | None = None, stiffness: float | None = None, damping: float | None = None
+    task: Task,
+    family: str | None = None,
+    stiffness: float | None = None,
+    damping: float | None = None,
+    smoothing: float | None = None,
 ) -> tuple[ContactPoint, tuple[str, ...]]:
     """Return the contact model of a single run, and its warnings: by default the task's main family at its middle
     stiffness. OptionError for a stiffness or damping that the family does not take."""
     families, stiffnesses = single_defaults(
         task, None if family is None else (family,), None if stiffness is None else (stiffness,)
     )
-    reject_untaken(families, stiffness=stiffness, damping=damping)
-    (point,), messages = family_grid(task, families, stiffnesses, damping)
+    reject_untaken(families, stiffness=stiffness, damping=damping, smoothing=smoothing)
+    (point,), messages = family_grid(task, families, stiffnesses, damping, smoothing)
     return point, messages
 
 
@@ -197,18 +204,27 @@ def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
         raise ValueError(f"a contact model's numbers are too large or too small: {error}") from error
 
 
-def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:
+def _contact(
+    task: Task, family: str, stiffness: float | None, damping: float | None, smoothing: float | None = None
+) -> ContactModel:
     """Build a family's contact model with a damping [N s/m]; by default the task's, if the family has none."""
-    if damping is None and family in FAMILIES and FAMILIES[family].dampratio == 0:
+    law = bool(laws_of([family]))
+    if law and task.onset != "none":
+        raise OptionError("onset", f"is for MuJoCo's law, whose force jumps; {family} needs none: omit it")
+    if damping is None and family in FAMILIES and FAMILIES[family].dampratio == 0 and not law:
         damping = task.defaults.damping
     damping = None if stiffness is None else damping
     mass = 1.0 if stiffness is None else task.effective_mass
-    return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=mass)
+    edges = cone_edges(task.scene, *task.contact_pair) if law and task.contact_pair else 1
+    given = {"stiffness": stiffness, "damping": damping, "smoothing": smoothing if law else None}
+    return family_model(family, task.scene, **given, effective_mass=mass, edges=edges)
 
 
 def _stiffness(task: Task, contact: ContactModel | None) -> float | None:
     """Spring stiffness K [N/m] of a contact model not defined by one; None without contact or spring."""
     if task.contact_pair is None:
+        return None
+    if contact is not None and contact.law is not None:
         return None
     if contact is None:
         solref = contact_pair(task.scene, *task.contact_pair).solref

@@ -142,7 +142,8 @@ def test_runge_kutta_is_compared_with_the_engine() -> None:
     report = check(f'<option integrator="RK4"/><worldbody>{rod}</worldbody>{motor}', states=2)
     (step,) = report.steps
     assert report.passed and report.findings == () and step.states == 2
-    assert step.engine_step <= 1e-8 and step.stock_step <= 1e-8
+    assert step.engine_step is not None and step.engine_step <= 1e-8
+    assert step.stock_step is not None and step.stock_step <= 1e-8
     assert step.engine is not None and step.engine < 1e-6
 
 

@@ -1,0 +1,159 @@
+"""Contact laws beyond MuJoCo's: static load, derivatives, what commands leave out for them, refusals."""
+
+import builtins
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjx_study as study
+from mjx_study import cli
+from mjx_study.bench import plan_bench, run_bench
+from mjx_study.choices import laws_of
+from mjx_study.objective import rollout_cost
+from mjx_study.simulation.contact import apply_contact, cone_edges, effective_mass, family_model
+from mjx_study.simulation.dynamics import State, step
+from mjx_study.simulation.law import LAWS
+from mjx_study.simulation.scene import Scene, put_scene
+from mjx_study.tasks import make_task
+
+BALL = """<mujoco><option timestep="0.002" cone="{}"/><worldbody><geom name="floor" type="plane" size="5 5 1"/>
+  <body pos="0 0 0.1"><freejoint/><geom name="ball" size="0.1" mass="1"/></body></worldbody></mujoco>"""
+PAIR = ("ball", "floor")
+WEIGHT = 9.81
+ACCURACY = dict.fromkeys(LAWS, 1e-5) | {"conic": 5e-3}  # the cone's own derivative is off by 2e-3 here
+
+
+def ball(cone: str = "pyramidal") -> Scene:
+    return put_scene(mujoco.MjModel.from_xml_string(BALL.format(cone)), "ball")
+
+
+def stepping(scene: Scene, law: str, stiffness: float | None = None):
+    mass = effective_mass(scene, *PAIR)
+    contact = family_model(law, scene, stiffness=stiffness, effective_mass=mass, edges=cone_edges(scene, *PAIR))
+    return partial(step, scene, apply_contact(scene.model, contact), control=jnp.zeros(0))
+
+
+@pytest.fixture(autouse=True)
+def _installed(request: pytest.FixtureRequest) -> None:
+    if "missing" not in request.node.name:
+        pytest.importorskip("mujodico", reason="the extra laws is not installed")
+
+
+def test_every_law_is_a_family() -> None:
+    assert laws_of(study.FAMILIES) == list(LAWS)
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("law", ["hunt_crossley", "kelvin_voigt"])
+def test_a_static_load_measures_the_stiffness(law: str, cone: str) -> None:
+    scene, stiffness = ball(cone), 2000.0
+    advance = stepping(scene, law, stiffness)
+    start = study.initial_state(scene)
+    last = jax.jit(lambda state: jax.lax.fori_loop(0, 3000, lambda _, at: advance(state=at)[0], state))(start)
+    assert float(jnp.abs(last.qvel).max()) < 1e-6
+    assert WEIGHT / (0.1 - float(last.qpos[2])) == pytest.approx(stiffness, rel=0.01)
+
+
+@pytest.mark.parametrize("law", list(LAWS))
+def test_derivatives_are_those_of_differences_in_both_modes(law: str) -> None:
+    scene = ball()
+    advance = stepping(scene, law, 2000.0 if study.FAMILIES[law].swept else None)
+    moved = jnp.array([0.3, 0.1, -0.2, 0.4, -0.3, 0.2])
+
+    def after(height_and_qvel: jax.Array) -> jax.Array:
+        qpos = scene.template.qpos.at[2].set(height_and_qvel[0])
+        found = advance(state=State(qpos, height_and_qvel[1:], scene.template.act, jnp.zeros(6)))[0]
+        return jnp.concatenate([found.qpos, found.qvel])
+
+    point = jnp.concatenate([jnp.array([0.099]), moved])
+    forward, reverse = (jax.jit(mode(after))(point) for mode in (jax.jacfwd, jax.jacrev))
+    np.testing.assert_allclose(forward, reverse, atol=1e-9)
+    size, run = 1e-6, jax.jit(after)
+    differences = np.stack([(run(point + d) - run(point - d)) / (2 * size) for d in size * jnp.eye(7)], axis=1)
+    np.testing.assert_allclose(forward, differences, atol=ACCURACY[law] * np.abs(differences).max())
+
+
+@pytest.mark.parametrize(
+    ("law", "given", "cone", "message"),
+    [
+        *((law, {"smoothing": 0.0}, "pyramidal", "needs a smoothing above 0") for law in LAWS),
+        ("hunt_crossley", {"stiffness": 1.0, "damping": 1.0}, "pyramidal", "in s/m: omit the damping"),
+        ("log_barrier", {}, "elliptic", "does not support elliptic cones"),
+    ],
+)
+def test_what_a_law_lacks_is_refused(law: str, given: dict[str, Any], cone: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        family_model(law, ball(cone), effective_mass=1.0, **given)
+
+
+def test_gradcheck_counts_what_has_no_counterpart(capsys: pytest.CaptureFixture[str]) -> None:
+    """Its own differences judge the derivative; the steps of mjx.step and the C engine are those of another law."""
+    law = ["momentum_transfer", "--contact", "hunt_crossley", "--stiffness", "1000", "--states", "3"]
+    assert cli.main(["gradcheck", *law, "--horizon", "110", "--smoothing", "1e-4", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    (own,) = document["steps"]
+    assert own["stock_step"] is own["engine_step"] is own["engine"] is None
+    assert own["verdict"] == "right" and own["differences"] < 1e-6 and own["coverage"]["counts"]["push"]
+    (said,) = [warning for warning in document["warnings"] if "not compared" in warning]
+    assert said.startswith("hunt_crossley, K = 1000 N/m: 3 states not compared with mjx.step and the C engine")
+
+
+@pytest.mark.slow
+def test_bench_leaves_out_rivals_of_another_law() -> None:
+    defaults = study.StudyDefaults(stiffnesses=(100.0,), families=("hunt_crossley",))
+    report = run_bench(plan_bench(make_task("pusher", horizon=3).replace(defaults=defaults), 6))
+    assert report.contact.startswith("hunt_crossley")
+    assert set(report.ratios) == {"gradient_per_value", "onset_per_gradient"}
+    assert any("left out" in line for line in report.lines())
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("gradcheck pusher --contact conic --stock", "--stock is for MuJoCo's law, which conic does not have"),
+        ("diagnose pusher --contact conic", "--contact describes contacts in the terms of MuJoCo's law"),
+        ("rollout pusher --contact mujoco --smoothing 1e-5", "--smoothing has no effect on MuJoCo's law"),
+        ("sweep pusher --contact conic --onset linear --dry-run", "--onset is for MuJoCo's law"),
+        ("sweep pusher --contact mujoco,conic --estimators fobg_onset --dry-run", "corrects MuJoCo's law, not conic"),
+    ],
+)
+def test_what_is_only_for_mujocos_law_is_refused(
+    command: str, message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(command.split()) == 2
+    printed = capsys.readouterr().err
+    assert message in printed and printed.count("\n") == 1, printed
+
+
+def test_forces_and_onsets_of_mujocos_law_are_refused() -> None:
+    task = make_task("pusher", horizon=3)
+    contact = family_model("conic", task.scene, effective_mass=1.0)
+    seen = study.observed(task.scene, study.initial_state(task.scene), contact, jnp.zeros(task.scene.host.nu))
+    with pytest.raises(ValueError, match="contact_force has forces of MuJoCo's law"):
+        seen.contact_force("pusher", "slider")
+    assert seen.xpos.shape == (task.scene.host.nbody, 3)  # what moves has no law
+    noise = jnp.zeros(task.policy.noise_shape)
+    for onset in ("linear", "jump"):
+        with pytest.raises(ValueError, match="the onset term is that of MuJoCo's law"):
+            rollout_cost(task, task.theta, contact, study.initial_state(task.scene), noise, onset)
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = builtins.__import__
+
+    def without(name: str, *rest):
+        if name.startswith("mujodico"):
+            raise ModuleNotFoundError(f"No module named {name!r}")
+        return own(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ValueError, match=r"pip install 'mjx-study\[laws\]'"):
+        family_model("conic", ball(), effective_mass=1.0)
