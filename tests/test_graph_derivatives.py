@@ -23,6 +23,12 @@ ROW = np.array([0.3, -1.2, 2.5])
 SPECIAL = (0.0, -0.0, 1.0, -1.0, 0.5, 2.0, -2.5, 1e-200, 1e200, np.inf, -np.inf, np.nan)
 PAIRS = [(a, b) for a in SPECIAL for b in (0.0, 1.0, -1.0, 2.0, 0.5, np.inf, np.nan)]
 ONE = [(a,) for a in SPECIAL]
+
+
+def bits(x: Any) -> Any:
+    return lax.bitcast_convert_type(x, np.uint64)
+
+
 OPERATIONS: dict[str, tuple[Function, list[tuple[float, ...]]]] = {
     **{
         name: (getattr(lax, name), ONE)
@@ -44,6 +50,8 @@ OPERATIONS: dict[str, tuple[Function, list[tuple[float, ...]]]] = {
     "clamp": (lambda x, y: lax.clamp(y, x, y + 1) + lax.clamp(-1.0, x, y) + lax.clamp(-1.0, x, 1.0), PAIRS),
     "convert_element_type": (lambda x: x.astype(int) * x.astype(jnp.float32).astype(float), ONE),
     "integer_pow": (lambda x: (x**3, x**2, x**-1, x**-2), ONE),
+    "shift_left": (lambda x: jnp.where(bits(x) << np.uint64(12) > np.uint64(1 << 62), x, x**2), ONE),
+    "shift_right_logical": (lambda x: jnp.where(bits(x) >> np.uint64(52) > np.uint64(1022), x, x**2), ONE),
     "select_n": (lambda x, y: (lax.select(x > y, x, jnp.sqrt(y)), lax.select_n(jnp.int32(x > 0), x * y, y)), PAIRS),
 }
 

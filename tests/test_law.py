@@ -130,7 +130,8 @@ def test_what_is_only_for_mujocos_law_is_refused(
     monkeypatch.chdir(tmp_path)
     assert cli.main(command.split()) == 2
     printed = capsys.readouterr().err
-    assert message in printed and printed.count("\n") == 1, printed
+    said = [line for line in printed.splitlines() if line.startswith("mjx-study: ")]
+    assert len(said) == 1 and message in said[0], printed
 
 
 def test_forces_and_onsets_of_mujocos_law_are_refused() -> None:

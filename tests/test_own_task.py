@@ -59,10 +59,16 @@ def cart(horizon=3):
 
 @pytest.fixture(autouse=True)
 def nothing_stays_imported() -> Iterator[None]:
-    before, path = set(sys.modules), list(sys.path)
+    forget()
+    path = list(sys.path)
     yield
     assert sys.path == path
-    for name in set(sys.modules) - before:
+    forget()
+
+
+def forget() -> None:
+    """Forget modules of these names, those of other tests, too."""
+    for name in list(sys.modules):
         if name.split(".")[0] in ("my_tasks", "mine", "broken", "inner"):
             del sys.modules[name]
 
