@@ -1,10 +1,13 @@
 """Gradients of other engines: the cells that need no other environment, the verdicts, and the page."""
 
+import json
 import math
+import subprocess
 
 import numpy as np
 import pytest
 
+from experiments import ROOT
 from experiments.engines import catalog
 from experiments.engines.adapters import mujoco_family
 from experiments.engines.judge import combined, measure, verdict
@@ -58,3 +61,30 @@ def test_environments_are_pinned_and_every_engine_has_one() -> None:
     packages = [package for each in catalog.ENVIRONMENTS.values() for package in each.packages]
     assert packages and all("==" in package or "<" in package for package in packages)
     assert {engine.environment for engine in catalog.ENGINES.values()} == set(catalog.ENVIRONMENTS)
+
+
+FREE_FLIGHT = """
+import dataclasses, json, os, sys
+os.environ["JAX_ENABLE_X64"] = "1"
+from importlib import import_module
+import numpy as np
+from experiments.engines.scenes import SCENES
+scene = dataclasses.replace(SCENES["toss"], horizon=0.1)
+found = import_module("experiments.engines.adapters." + sys.argv[1]).build(scene, 0.005, sys.argv[2])(np.array([1.0]))
+print(json.dumps([found.positions[0, 0].tolist(), float(found.values[0]), float(found.derivatives[0])]))
+"""
+
+
+@pytest.mark.parametrize("name", ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap"])
+def test_free_flight_of_what_is_installed(name: str) -> None:
+    engine = catalog.ENGINES[name]
+    python = catalog.interpreter(engine)
+    if not python.exists():
+        pytest.skip(f"{name}: not installed")
+    words = [python, "-c", FREE_FLIGHT, engine.adapter, engine.variant]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    position, value, derivative = json.loads(done.stdout.splitlines()[-1])
+    z, late = 1 - 0.1 - 9.81 * 0.1**2 / 2, 9.81 * 0.005 * 0.1
+    assert np.allclose(position[:2], [0.1, 0], atol=1e-5) and abs(position[2] - z) < late
+    assert np.isclose(value, SCENES["toss"].cost(np.array([position])), rtol=1e-5)
+    assert np.isclose(derivative, SCENES["toss"].cost_gradient(np.array([position]))[0, 2], rtol=1e-4)

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from experiments.arm import GOAL, LENGTH, SPEED
 from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
 from mjx_study.tasks.landing import TORQUE
@@ -62,3 +63,20 @@ def test_the_table_brakes_the_box_by_its_weight() -> None:
     )
     _, way = played(make_task("gripper"), 0)
     assert np.abs(way[-1][0].qpos[4:6]).max() > 0.02
+
+
+def test_an_arm_knocks_its_box_towards_the_goal() -> None:
+    """The knuckle touches the box, which starts apart, moves on and stays flat on the floor; costs see C's bodies."""
+    task = make_task("experiments.arm:push")
+    host = task.scene.host
+    for seed in range(3):
+        touching, way = played(task, seed)
+        first, last = way[0][0], way[-1][0]
+        data = mujoco.MjData(host)
+        data.qpos, data.qvel = last.qpos, last.qvel
+        mujoco.mj_forward(host, data)
+        assert not touching[0].all() and touching.any(axis=0).all()
+        assert float(last.qpos[7] - first.qpos[7]) > 0.03 and data.body("box").xmat[8] > 0.99
+        miss = np.sum((data.body("box").xpos[:2] - np.array(GOAL)) ** 2) / LENGTH**2
+        expected = miss + np.sum(np.asarray(last.qvel[7:10]) ** 2) / SPEED**2
+        assert float(task.costs()[1](last)) == pytest.approx(expected, rel=1e-9)

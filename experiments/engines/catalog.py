@@ -53,6 +53,9 @@ ENVIRONMENTS: Final = {
     "old_mjx": Environment(
         ("mujoco-mjx==3.1.6", "mujoco==3.1.6", "jax==0.4.30", "jaxlib==0.4.30", "numpy<2", "scipy<1.13")
     ),
+    "newton": Environment(("newton==1.8.0", "warp-lang==1.19.0")),
+    "jaxsim": Environment(("jaxsim==0.9.0", "jax==0.10.2", "jaxlib==0.10.2")),
+    "drake": Environment(("drake==1.58.0",), ("3.12",)),
 }
 ENGINES: Final = {
     "mjx": Engine("MJX 3.17.0", "own", "mujoco_family", "forward", "forward mode, default solver"),
@@ -66,6 +69,15 @@ ENGINES: Final = {
     **{
         f"brax_{name}": Engine(f"brax 0.14.2, {name}", "brax", "brax_pipelines", name, "reverse mode")
         for name in ("spring", "positional", "generalized")
+    },
+    **{
+        f"newton_{name}": Engine(f"Newton 1.8.0, {name}", "newton", "newton_warp", name, "Warp's tape", single=True)
+        for name in ("semi_implicit",)
+    },
+    "jaxsim": Engine("JaxSim 0.9.0, soft", "jaxsim", "jaxsim_soft", "SemiImplicitEuler", "reverse mode"),
+    **{
+        f"drake_{name}": Engine(f"Drake 1.58.0, {name}", "drake", "drake_plant", name, "AutoDiffXd", slow=True)
+        for name in ("sap",)
     },
     "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode"),
 }

@@ -6,14 +6,24 @@ python -m experiments.engines.install [ENVIRONMENT ...]
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 from experiments.engines.catalog import ENVIRONMENTS, HOME
+
+
+def find_python(version: str) -> str | None:
+    """Return a Python of a minor version that runs: of the path, or of pyenv, whose shims may be of none."""
+    kept = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
+    for path in (shutil.which(f"python{version}"), *map(str, reversed(kept))):
+        if path and subprocess.run([path, "-c", ""], capture_output=True, check=False).returncode == 0:
+            return path
+    return None
 
 
 def install(name: str) -> bool:
     """Make one environment, and return whether that succeeded; one that exists is brought to its pins."""
     environment, folder = ENVIRONMENTS[name], HOME / name
-    python = next((path for version in environment.python if (path := shutil.which(f"python{version}"))), None)
+    python = next((path for version in environment.python if (path := find_python(version))), None)
     if python is None:
         print(f"{name}: needs Python {' or '.join(environment.python)}")
         return False
