@@ -24,6 +24,7 @@ from mjx_study.experiment import gradient_numbers
 from mjx_study.graph import build
 from mjx_study.graph.native import SWITCH, native_identity
 from mjx_study.objective import Simulator, programs
+from mjx_study.objective.batches import compiled_rollout
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.tasks import Task, make_task
 
@@ -57,6 +58,19 @@ def test_a_trace_is_found_again_and_gives_the_same_bits(folder: Path, monkeypatc
     monkeypatch.setattr(compiled, "traces_folder", lambda: None)
     with pytest.raises(AssertionError, match="traced"):
         evaluated(pusher())
+
+
+def test_a_rollout_alone_is_found_again_though_its_native_code_is_not_for_batches(folder: Path) -> None:
+    given = pusher().theta, None, jax.random.key(0), 1.0
+    first = cost_of_one_rollout(*given)
+    (path,) = folder.glob("*.trace")
+    written = path.stat().st_mtime_ns
+    np.testing.assert_array_equal(cost_of_one_rollout(*given), first)
+    assert [path.stat().st_mtime_ns] == [each.stat().st_mtime_ns for each in folder.glob("*.trace")] == [written]
+
+
+def cost_of_one_rollout(*given: Any) -> np.ndarray:
+    return np.asarray(compiled_rollout(pusher())(*given)[2])
 
 
 def test_without_a_folder_the_bits_are_the_same(monkeypatch: pytest.MonkeyPatch):

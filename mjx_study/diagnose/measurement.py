@@ -30,7 +30,7 @@ from mjx_study.tasks.task import Task
 ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
 SAMPLES: Final = 500
 """Samples per batch, if time allows."""
-BUDGET_SECONDS: Final = 60.0
+BUDGET_SECONDS: Final = 30.0
 """Time for all batches, compilation excluded [s]."""
 LARGE_CHUNK: Final = 8
 """Samples per program call on a CPU for large models: a call takes the time of all of them, however few are

@@ -16,7 +16,7 @@ the linear term, it does not depend on the contact's damping or stiffness.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Final
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +24,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Scalar
-from mjx_study.simulation.dynamics import Control, ControlLaw, Controls, State, force_stage, solved_step, step
+from mjx_study.simulation.dynamics import Control, ControlLaw, Controls, State, solved_step, step, with_solver
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import SLOTS, guard_at, least_travel, on_and_off
+from mjx_study.simulation.onset import Passage, least_travel, passage
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, find_events
 
+SLOTS: Final = 8
+"""Number of events with branches of their own per rollout; later ones are only counted."""
 CostToGo = Callable[[Int[Array, ""], State], Scalar]
 
 
@@ -49,7 +51,7 @@ def jump_term(
         states: states from `dynamics.rollout`, `(horizon + 1, ...)`, with their derivatives.
         control_law: control law of the rollout, independent of the differentiated inputs.
         running_cost, final_cost: as in `tasks.Task`.
-        slots: maximum number of onsets to correct, earliest first.
+        slots: maximum number of events to correct, earliest first.
     """
     before, controls = jax.lax.stop_gradient((jax.tree.map(lambda leaf: leaf[:-1], states), controls))
     if not scene.has_constraints:
@@ -95,25 +97,23 @@ def _weights(
     """(1 - s) J_k n / D and s J_{k-1} n / D of one event; whether its cell is too narrow, and whether it is valid."""
     host, timestep = scene.host, scene.timestep
     qpos, qvel = before.qpos[event.step], before.qvel[event.step]
-    touch = at_touch(model, scene.template, qpos, qvel, event)
-    start, positioned = integrate_position(host, qpos, -qvel, timestep * touch.share), touch.positioned
-    guard = guard_at(model, positioned, qvel, event)
+    touch = with_solver(at_touch, model, scene.template, qpos, qvel, event)
+    start = integrate_position(host, qpos, -qvel, timestep * touch.share)
 
     def jump(index):
-        prepared = force_stage(model, positioned, before.qvel[index], before.act[index], controls[index])
-        prepared = prepared.replace(qacc_warmstart=before.warmstart[index])
-        (after, act), qacc = on_and_off(model, prepared, guard)
+        state = before.qvel[index], before.act[index], controls[index], before.warmstart[index]
 
-        def go_on(qvel, act, qacc):
-            return cost_to_go(index + 1, State(integrate_position(host, start, qvel, timestep), qvel, act, qacc))
+        def go_on(off):
+            found = with_solver(passage, model, scene.template, touch.qpos, qvel, *state, event, off)
+            after = State(integrate_position(host, start, found.qvel, timestep), found.qvel, found.act, found.qacc)
+            return cost_to_go(index + 1, after), found
 
-        on, off = jax.vmap(go_on)(after, act, qacc)
-        return on - off, qacc
+        (on, off), found = jax.vmap(go_on)(jnp.array([0.0, 1.0], qvel.dtype))
+        return on - off, found
 
-    (here, previous), (qacc, _) = jax.vmap(jump)(jnp.stack([event.step, event.step - 1]))
-    rows: Any = positioned._impl
-    normal = guard.weights @ rows.efc_J
-    least = least_travel(model, positioned.replace(qvel=qvel), guard, qacc, event.ends)
+    (here, previous), found = jax.vmap(jump)(jnp.stack([event.step, event.step - 1]))
+    first: Passage = jax.tree.map(lambda leaf: leaf[0], found)
+    normal, least = first.normal[0], least_travel(model, first, event.ends)
     cell, (last, earlier) = -jnp.maximum(jnp.abs(touch.travel), least), touch.weights
     weights = jnp.stack([last * here, earlier * previous])[:, None] * normal / cell
     return jnp.where(touch.valid, weights, 0.0), jnp.stack([touch.valid & (jnp.abs(touch.travel) < least), touch.valid])

@@ -19,7 +19,7 @@ from mjx_study.choices import unknown
 from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.dynamics import Qvel, State, fwd_position
+from mjx_study.simulation.dynamics import Qvel, State, fwd_position, with_solver
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.native_step import solved_natively
 from mjx_study.simulation.onset import Moving, differentiated_once, onset_term, tangent_of
@@ -230,7 +230,8 @@ def _step_terms(
         guard = jnp.argmax(left)
         brief, others = ends[guard] & preceding.begun[guard], crossing.others(guard)
         event = Events(jnp.zeros((), int), guard, ends[guard], brief, *others, jnp.array(True))
-        parts = onset_term(model, data, states, data.ctrl[None], event, moving)[:2]
+        term = onset_term(with_solver, model, data, states, data.ctrl[None], event, moving)[0]
+        parts = (jnp.outer(each, term.slope) for each in (term.spread, term.shift))
         return left.at[guard].set(False), *(total + part for total, part in zip(sums, parts, strict=True))
 
     # the loop over a batch ends with the last event of any sample

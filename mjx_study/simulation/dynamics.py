@@ -148,7 +148,7 @@ def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Control
 
 def solved_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, guards.Course]:
     """`step` without derivatives, and the course of the guards in it."""
-    return _with_solver(partial(_solved_step, scene), model, state, control)
+    return with_solver(partial(_solved_step, scene), model, state, control)
 
 
 def _solved_step(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Array):
@@ -170,7 +170,7 @@ def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: A
     return function(model, *arguments)
 
 
-def _with_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
+def with_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
     """Evaluate `function(solver, model, *arguments)`, of any size if native code pays for it, else `entry_by_entry`."""
     plain, solved = (partial(function, solver) for solver in (constraint.run_solver, constraint.newton))
     larger = model.nv > MOST_UNROLLED and constraint.OWN_SOLVER and native_identity() is not None
@@ -314,7 +314,7 @@ def _differentiable_step(scene: Scene, model: mjx.Model, state: State, control: 
     traced_model, whole = traced_part(model)
 
     def solved(traced: Any, state: State, control: Control) -> tuple[State, Scalar]:
-        return _with_solver(partial(_values, scene), whole(traced), state, control)
+        return with_solver(partial(_values, scene), whole(traced), state, control)
 
     def rule(primals: Any, changes: Any) -> Any:
         following, residual = advance(*primals)

@@ -30,24 +30,29 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 (arXiv 2306.06862), for the continuous-time limit.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
-from mjx_study.graph.derivative_rule import refusing, with_rule
+from mjx_study.graph.derivative_rule import instantiated, refusing, with_rule
 from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Rows, Scalar
 from mjx_study.simulation.dynamics import (
+    Act,
+    Control,
     ControlLaw,
     Controls,
+    Point,
+    Qpos,
     State,
     advance_velocity,
     entry_by_entry,
@@ -57,15 +62,20 @@ from mjx_study.simulation.dynamics import (
     solved_step,
     step_change,
     trajectory,
+    with_solver,
 )
 from mjx_study.simulation.guards import Course
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.linear_algebra import product
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product
 from mjx_study.simulation.scene import Scene
-from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, find_events
+from mjx_study.simulation.touch import Events, OnsetCounts, Touch, at_touch, find_events
 
-SLOTS: Final = 8
-"""Number of onsets corrected per rollout; later ones are only counted."""
+SLOTS: Final = 32
+"""Number of events corrected per rollout; later ones are only counted."""
+PER_STEP: Final = 4
+"""Number of events corrected per step; further ones are only counted."""
+TOGETHER: Final = 8
+"""Number of events that an accelerator computes in the time of one."""
 
 
 def check_onset(onset: str) -> None:
@@ -94,7 +104,7 @@ def corrected_rollout(
 
     Args:
         model: the model to step; may be traced, but not differentiated (TypeError).
-        slots: maximum number of onsets to correct, earliest first.
+        slots: maximum number of events to correct, earliest first.
         weight: factor of the term; 0 gives the derivatives of `dynamics.rollout`.
         inputs: inputs of the control law, as for `dynamics.simulated`; None for the steps' indices.
     """
@@ -110,107 +120,146 @@ def corrected_rollout(
         return following, (state, control, following, residual, course)
 
     _, (before, controls, after, residuals, course) = jax.lax.scan(observe, jax.lax.stop_gradient(start), inputs)
-    spread, shift, counts = _corrections(scene, model, before, controls, course, slots)
-    spread, shift = weight * spread, weight * shift
+    terms, first, counts = _corrections(scene, model, before, controls, course, slots)
 
-    def follow(change: State, known):
-        given, fixed, fixed_control, fixed_after, spread, shift = known
-        state = jax.tree.map(lambda value, moved: value + tangent_of(moved), fixed, change)
+    rows = jnp.arange(min(PER_STEP, slots, course.distance.shape[1]))
+
+    def follow(state: State, known):
+        given, fixed, after, (first, following) = known
         control = control_law(given, state)
-        moved = tangent_of(difference_position(scene.host, fixed.qpos, state.qpos))
-        velocity = tangent_along(shift, moved - scene.timestep * change.qvel)
-        carried = tangent_of(integrate_position(scene.host, fixed.qpos, velocity, scene.timestep))
-        point = fixed.qpos, fixed.qvel, fixed.act, fixed_control
-        moving = change.qpos + carried, change.qvel + velocity, change.act, tangent_of(control)
-        _, qvel, act, _ = map(tangent_of, step_change(scene, model, point, fixed_after.warmstart, moving))
-        qvel = qvel + tangent_along(spread, moved)
-        qpos = integrate_position(
-            scene.host, fixed.qpos + change.qpos + carried, fixed_after.qvel + qvel, scene.timestep
-        )
-        following = State(tangent_of(qpos), qvel, act, jnp.zeros_like(qvel))
-        return following, (following, tangent_of(control))
+        own, used = jnp.minimum(first + rows, max(slots - 1, 0)), (first + rows < following)[:, None]
+        spread, shift, slope = (jnp.where(used, leaf[own], 0) for leaf in terms)
+        moved = difference_position(scene.host, fixed.qpos, state.qpos)
+        velocity = tangent_along(shift, slope, moved - scene.timestep * state.qvel)
+        qpos = integrate_position(scene.host, state.qpos, velocity, scene.timestep)
+        qvel, act = _known_step(scene, model, (qpos, state.qvel + velocity, state.act, control), after)
+        qvel = qvel + tangent_along(spread, slope, moved)
+        following = State(integrate_position(scene.host, qpos, qvel, scene.timestep), qvel, act, after.warmstart)
+        return following, (following, control)
 
-    known = (inputs, before, controls, after, spread, shift)
-    _, (changes, over_controls) = jax.lax.scan(follow, jax.tree.map(tangent_of, start), known)
-    states = jax.tree.map(jnp.add, after, changes)
+    terms = terms._replace(spread=weight * terms.spread, shift=weight * terms.shift)
+    _, (states, over_controls) = jax.lax.scan(follow, start, (inputs, before, after, (first[:-1], first[1:])))
+    states, controls = jax.tree.map(
+        lambda known, each: known + tangent_of(each), (after, controls), (states, over_controls)
+    )
     whole = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
-    return whole, controls + over_controls, residuals, counts
+    return whole, controls, residuals, counts
+
+
+def _known_step(scene: Scene, model: mjx.Model, point: Point, after: State) -> tuple[Qvel, Act]:
+    """Velocity and activations after a step, which are known, with their derivatives over what precedes it."""
+    traced, whole = traced_part(model)
+
+    def known(traced: Any, point: Point, after: State) -> tuple[Qvel, Act]:
+        return after.qvel, after.act
+
+    def rule(primals: Any, changes: Any) -> Any:
+        traced, point, after = primals
+        moved = instantiated(point, changes[1])
+        change = step_change(scene, whole(traced), differentiated_once(point), after.warmstart, moved)
+        return step(*primals), change[1:3]
+
+    step = with_rule(known, rule)
+    return step(traced, point, after)
+
+
+class Terms(NamedTuple):
+    """Terms of events.
+
+    Attributes:
+        spread, shift: (1 - s) Delta_k / D and s Delta_{k-1} / D.
+        slope: n, the derivative of the guard's distance.
+    """
+
+    spread: Float[Array, "*events nv"]
+    shift: Float[Array, "*events nv"]
+    slope: Float[Array, "*events changes"]
 
 
 def _corrections(
     scene: Scene, model: mjx.Model, before: State, controls: Controls, course: Course, slots: int
-) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
-    """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero without events, and counts."""
-    events, without = find_events(course, scene.timestep, slots)
+) -> tuple[Terms, Int[Array, " horizon_and_1"], OnsetCounts]:
+    """Terms of the events, the first event of every step, and counts."""
+    events, without = find_events(course, scene.timestep, slots, PER_STEP)
 
     def term(event: Events):
         pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
         states, inputs = jax.tree.map(pick, before), pick(controls)
-        return entry_by_entry(onset_term, model, scene.template, states, inputs, event)
+        if model.nv > MOST_UNROLLED:  # in several graphs
+            return onset_term(with_solver, model, scene.template, states, inputs, event)
+        return entry_by_entry(partial(onset_term, with_run_solver), model, scene.template, states, inputs, event)
 
     def fill(carry):
-        slot, terms = carry
+        slot, found = carry
         some = jnp.minimum(slot + jnp.arange(together), slots - 1)
-        found = jax.vmap(term)(jax.tree.map(lambda leaf: leaf[some], events))
-        return slot + together, jax.tree.map(lambda every, one: every.at[some].set(one), terms, found)
+        more = jax.vmap(term)(jax.tree.map(lambda leaf: leaf[some], events))
+        return slot + together, jax.tree.map(lambda every, one: every.at[some].set(one), found, more)
 
-    # Most rollouts have fewer events than slots; an accelerator computes all slots in the time of one.
-    together = 1 if jax.default_backend() == "cpu" else slots
-    filled, (size, dtype) = jnp.sum(events.used), (scene.host.nv, course.distance.dtype)
-    matrix, flag = jnp.zeros((slots, size, size), dtype), jnp.zeros(slots, bool)
-    terms = matrix, matrix, jnp.zeros(slots, dtype), flag, flag
-    if slots:
-        _, terms = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, (jnp.zeros_like(filled), terms))
-    here, previous, strength, narrow, valid = terms
-    empty = jnp.zeros((len(before.qpos), size, size), dtype)
-    spread, shift = (empty.at[events.step].add(terms) for terms in (here, previous))
-    return spread, shift, events.counts(without, valid, narrow, strength)
+    together = 1 if jax.default_backend() == "cpu" else min(TOGETHER, slots)
+    filled, dtype = jnp.sum(events.used), course.distance.dtype
+    vector, flag = jnp.zeros((max(slots, 1), scene.host.nv), dtype), jnp.zeros(slots, bool)
+    found = Terms(vector, vector, vector), jnp.zeros(slots, dtype), flag, flag
+    if slots:  # not a scan: the loop over a batch ends with the last event of any rollout
+        _, found = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, (jnp.zeros_like(filled), found))
+    terms, strength, narrow, valid = found
+    starts = jnp.arange(len(before.qpos) + 1)
+    first = jnp.sum(jnp.where(events.used, events.step, len(starts)) < starts[:, None], axis=1)
+    return terms, first, events.counts(without, valid, narrow, strength)
 
 
 Moving = Mapping[int, Array]
 """Leaves of a model that change, by their places in it."""
+Call = Callable[..., Any]
+"""Evaluates `function(solver, model, *arguments)` from (function, model, *arguments)."""
 
 
 def onset_term(
+    call: Call,
     model: mjx.Model,
     template: mjx.Data,
     states: State,
     controls: Float[Array, "cases nu"],
     event: Events,
     moving: Moving = MappingProxyType({}),
-) -> tuple[Float[Array, "nv changes"], Float[Array, "nv changes"], Scalar, Bool[Array, ""], Bool[Array, ""]]:
-    """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, share of the approach speed lost, whether D was bounded, and
-    whether the contact begins or ends by motion within the step; zeros and False otherwise.
+) -> tuple[Terms, Scalar, Bool[Array, ""], Bool[Array, ""]]:
+    """Term of an event, share of the approach speed lost, whether D was bounded, and whether the contact begins or ends
+    by motion within the step; zeros and False otherwise.
 
     Delta is v'(on) - v'(off) at first touch, and n the derivative of the guard's distance over the nv coordinates, then
     over the entries of the model's moving leaves.
 
     Args:
+        call: how to evaluate the parts, functions of a solver, the model and arrays: `with_solver`, or plainly.
         template: everything but the position.
         states, controls: velocities and activations before steps k and k - 1, and their controls; or of k for both.
         event: the contact or limit, and whether it ends.
         moving: leaves of the model that change.
     """
-    touch = at_touch(model, template, states.qpos[0], states.qvel[0], event)
-    positioned = touch.positioned
-    rows: Any = positioned._impl
-    guard = guard_at(model, positioned, states.qvel[0], event)
+    qpos, qvel = states.qpos[0], states.qvel[0]
+    touch: Touch = call(at_touch, model, template, qpos, qvel, event)
 
-    def jump(qvel, act, control, warmstart):
-        forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
-        (after, _), qacc = on_and_off(model, forced, guard)
-        return after[0] - after[1], qacc
+    def both(*before):
+        each = lambda off: call(passage, model, template, touch.qpos, qvel, *before, event, off)  # noqa: E731
+        return jax.vmap(each)(jnp.array([0.0, 1.0], qvel.dtype))
 
-    jumps, qacc = jax.vmap(jump)(states.qvel, states.act, controls, states.warmstart)
-    least = least_travel(model, positioned.replace(qvel=states.qvel[0]), guard, qacc[0], event.ends)
-    normal = guard.weights @ rows.efc_J
+    found: Passage = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
+    jumps, first = found.qvel[:, 0] - found.qvel[:, 1], jax.tree.map(lambda leaf: leaf[0], found)
+    least, normal = least_travel(model, first, event.ends), first.normal[0]
     cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
     last, before = touch.weights
-    slope = jnp.concatenate([normal, _slope_over(moving, model, positioned, states.qvel[0], event)])
-    here, previous = (jnp.outer(jump, slope) / cell for jump in (last * jumps[0], before * jumps[-1]))
+    slope = normal
+    if moving:
+        positioned = fwd_position(model, template.replace(qpos=touch.qpos))
+        slope = jnp.concatenate([normal, _slope_over(moving, model, positioned, qvel, event)])
     strength = -model.opt.timestep * (normal @ jumps[0]) / cell
-    here, previous, strength = (jnp.where(valid, each, jnp.zeros_like(each)) for each in (here, previous, strength))
-    return here, previous, strength, valid & (jnp.abs(touch.travel) < least), valid
+    term = Terms(last * jumps[0] / cell, before * jumps[-1] / cell, slope)
+    term, strength = jax.tree.map(lambda each: jnp.where(valid, each, 0.0), (term, strength))
+    return term, strength, valid & (jnp.abs(touch.travel) < least), valid
+
+
+def with_run_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
+    """Evaluate `function(solver, model, *arguments)` in MJX's operations."""
+    return function(constraint.run_solver, model, *arguments)
 
 
 def _slope_over(
@@ -253,34 +302,64 @@ def guard_at(model: mjx.Model, positioned: mjx.Data, qvel: Qvel, event: Events) 
     return GuardAtTouch(weights, deep, members[event.guard], absent, touching)
 
 
-def least_travel(
-    model: mjx.Model, data: mjx.Data, guard: GuardAtTouch, qacc: Float[Array, "2 nv"], ends: Bool[Array, ""]
-) -> Scalar:
+class Passage(NamedTuple):
+    """A step from the touch of a guard, with its rows on or off; or two, with them on and off.
+
+    Attributes:
+        qvel, act: velocity and activations after it.
+        qacc: acceleration in it.
+        normal: derivative of the guard's distance.
+        rate: see `guards.relaxation_rate`.
+        deep: as in `guards.Guards`.
+    """
+
+    qvel: Float[Array, "*case nv"]
+    act: Float[Array, "*case na"]
+    qacc: Float[Array, "*case nv"]
+    normal: Float[Array, "*case nv"]
+    rate: Float[Array, "*case"]
+    deep: Bool[Array, "*case"]
+
+
+def passage(
+    solver: constraint.Solver,
+    model: mjx.Model,
+    template: mjx.Data,
+    qpos: Qpos,
+    closing: Qvel,
+    qvel: Qvel,
+    act: Act,
+    control: Control,
+    warmstart: Qvel,
+    event: Events,
+    off: Scalar,
+) -> Passage:
+    """The step from a touch at `qpos`, with the rows of the event's guard, or without if `off` is 1.
+
+    The guard moves at velocity `closing`; velocity, activation, control and warm start are those of the step.
+    """
+    positioned = fwd_position(model, template.replace(qpos=qpos))
+    guard = guard_at(model, positioned, closing, event)
+    rows: Any = positioned._impl
+    forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
+    prepared = guards.at_first_touch(model, forced, guard.touching)
+    prepared = guards.without(prepared, guard.absent + off * guard.members)
+    qacc = solver(model, prepared)
+    rate = guards.relaxation_rate(model, positioned.replace(qvel=closing), guard.weights)
+    after, activation = advance_velocity(model, prepared, qacc)
+    return Passage(after, activation, qacc, guard.weights @ rows.efc_J, rate, guard.deep)
+
+
+def least_travel(model: mjx.Model, found: Passage, ends: Bool[Array, ""]) -> Scalar:
     """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
 
-    Arguments as for `guards.relaxation_rate`; the acceleration with and without the contact; whether contact ends.
+    Args:
+        found: steps with the contact and without.
+        ends: whether it ends.
     """
-    rows: Any = data._impl
-    on, off = jnp.abs((qacc @ rows.efc_J.T) @ guard.weights)
-    fastest = jnp.where(ends | guard.deep, jnp.maximum(on, off), off)
-    return model.opt.timestep * fastest / guards.relaxation_rate(model, data, guard.weights)
-
-
-def on_and_off(
-    model: mjx.Model, data: mjx.Data, guard: GuardAtTouch
-) -> tuple[tuple[Float[Array, "2 nv"], Float[Array, "2 na"]], Float[Array, "2 nv"]]:
-    """Velocities and activations after a step, and its accelerations, with the rows of a guard on or off.
-
-    The data are those of `force_stage`, with the solver's warm start.
-    """
-    touching = guards.at_first_touch(model, data, guard.touching)
-
-    def advanced(off):
-        prepared = guards.without(touching, guard.absent + off * guard.members)
-        qacc = constraint.run_solver(model, prepared)
-        return advance_velocity(model, prepared, qacc), qacc
-
-    return jax.vmap(advanced)(jnp.array([0.0, 1.0], guard.members.dtype))
+    on, off = jnp.abs(found.qacc @ found.normal[0])
+    fastest = jnp.where(ends | found.deep[0], jnp.maximum(on, off), off)
+    return model.opt.timestep * fastest / found.rate[0]
 
 
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -294,9 +373,12 @@ _tangent_of = with_rule(
 differentiated_once = refusing("derivatives with the onset term are of first order: it has no second derivative")
 
 
-def tangent_along(matrix: Float[Array, "outputs inputs"], inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
-    """Zero, whose derivative is the matrix times that of the inputs."""
-    return tangent_of(product(jax.lax.stop_gradient(matrix), inputs))
+def tangent_along(
+    jumps: Float[Array, "events nv"], slopes: Float[Array, "events nv"], moved: Float[Array, " nv"]
+) -> Float[Array, " nv"]:
+    """Zero, whose derivative is the sum of the jumps times the slopes' products with that of the motion."""
+    jumps, slopes = jax.lax.stop_gradient((jumps, slopes))
+    return tangent_of(product(jumps.T, product(slopes, moved)))
 
 
 def without_derivative(model: mjx.Model) -> mjx.Model:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from estimators.pytree import register_pytree
+from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qpos, Qvel, Scalar, fwd_position
 from mjx_study.simulation.guards import Course, motion
@@ -93,7 +94,7 @@ class Events:
 
 
 def find_events(
-    course: Course, timestep: float | Scalar, slots: int
+    course: Course, timestep: float | Scalar, slots: int, per_step: int | None = None
 ) -> tuple[Events, tuple[Int[Array, ""], Int[Array, ""]]]:
     """Find where contacts and limits may begin, or end under force (`at_touch` says whether they do).
 
@@ -102,6 +103,7 @@ def find_events(
     Args:
         course: what the guards do in each step.
         slots: maximum number of events to return.
+        per_step: maximum number of them at one step; None for any.
     """
     active = course.distance < 0
     before = jnp.roll(active, 1, axis=0)
@@ -110,7 +112,8 @@ def find_events(
     ends = before & jnp.roll(course.pushes, 1, axis=0) & (~active | crossing.ends)
     brief = ends ^ jnp.roll(active, 2, axis=0).at[:2].set(False)
     happens = (begins | ends).at[0].set(False)
-    (flat,) = jnp.nonzero(happens.reshape(-1), size=slots, fill_value=happens.size)
+    kept = happens if per_step is None else happens & (jnp.cumsum(happens, axis=1) <= per_step)
+    (flat,) = jnp.nonzero(kept.reshape(-1), size=slots, fill_value=happens.size)
     used = flat < happens.size
     step, guard = jnp.divmod(jnp.where(used, flat, happens.shape[1]), happens.shape[1])
     at_step = jax.tree.map(lambda leaf: leaf[step], crossing)
@@ -163,15 +166,28 @@ def replaced_points(course: Course, crossing: Crossings) -> Int[Array, ""]:
     """Number of contact points that appear or vanish where no guard passes zero; see `OnsetCounts`."""
     if course.points is None:
         return jnp.zeros((), int)
-    place, reach, geom = course.points
-    touching, pushes, begins, ends = (
-        each[:, -reach.shape[1] :] for each in (course.distance < 0, course.pushes, crossing.begins, crossing.ends)
+    contacts = course.points.reach.shape[1]
+    flags = [each[:, -contacts:] for each in (course.distance < 0, course.pushes, crossing.begins, crossing.ends)]
+    here, there = (
+        jax.tree.map(lambda leaf, part=part: leaf[part], (course.points, *flags))
+        for part in (slice(1, None), slice(-1))
     )
-    same = jnp.all(geom[1:, :, None] == geom[:-1, None], axis=-1) & touching[1:, :, None] & touching[:-1, None]
-    moved = jnp.linalg.norm(place[1:, :, None] - place[:-1, None], axis=-1)
-    near = same & (moved <= jnp.maximum(reach[1:, :, None], reach[:-1, None]))
-    appear = touching[1:] & ~begins[1:] & ~jnp.any(near, axis=2)
-    vanish = touching[:-1] & pushes[:-1] & ~ends[1:] & ~jnp.any(near, axis=1)
+    return jnp.sum(jax.vmap(partial(unrolled, _replaced))(here, there))
+
+
+def _replaced(here: Any, there: Any) -> Int[Array, ""]:
+    """Number of contact points that appear, or that vanish under force, from one step to the next.
+
+    Args:
+        here: points of a step; whether each touches, pushes, begins, and whether the one before ends.
+        there: the same of the step before.
+    """
+    (points, touching, _, begins, ends), (others, touched, pushed, *_) = here, there
+    same = jnp.all(points.geom[:, None] == others.geom[None], axis=-1) & touching[:, None] & touched[None]
+    moved = jnp.linalg.norm(points.place[:, None] - others.place[None], axis=-1)
+    near = same & (moved <= jnp.maximum(points.reach[:, None], others.reach[None]))
+    appear = touching & ~begins & ~jnp.any(near, axis=1)
+    vanish = touched & pushed & ~ends & ~jnp.any(near, axis=0)
     return jnp.sum(appear) + jnp.sum(vanish)
 
 
@@ -180,6 +196,7 @@ def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "
     return (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING_SHARE * travel)
 
 
+@register_pytree
 @dataclasses.dataclass(frozen=True)
 class Touch:
     """Where the distance of a guard passes zero within the step before k.
@@ -188,18 +205,18 @@ class Touch:
         share: s, the part of the step since then.
         weights: weights of the jumps of steps k and k - 1: 1 - s and s, or as in `at_touch`.
         travel: travel of the guard in a step at the rate that it has there, negative if it closes.
-        positioned: position stage close to it, in contact.
+        qpos: position close to it, in contact.
         valid: whether it passes zero within the step, by motion.
     """
 
     share: Scalar
     weights: tuple[Scalar, Scalar]
     travel: Scalar
-    positioned: mjx.Data
+    qpos: Qpos
     valid: Bool[Array, ""]
 
 
-def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event: Events) -> Touch:
+def at_touch(_: Any, model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event: Events) -> Touch:
     """Find the touch on the path of the step before k, on which the distance is a parabola.
 
     A body that passes an edge may be in contact for less than a step. A body slightly ahead of it then misses the edge,
@@ -208,13 +225,16 @@ def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event
     boundary is the one that the event before has already counted.
 
     Position and velocity are those before step k, at which the event begins or ends; the template has everything else.
+    The first argument is a solver's place, for callers of functions with one.
     """
     timestep, guard, ends = model.opt.timestep, event.guard, event.ends
 
+    def position(back):
+        return integrate_position(model, qpos, qvel, -timestep * back)
+
     def stage(back):
-        data = fwd_position(model, template.replace(qpos=integrate_position(model, qpos, qvel, -timestep * back)))
-        distance, speed = motion(model, data, qvel, ends)
-        return (distance[guard], timestep * speed[guard]), data
+        distance, speed = motion(model, fwd_position(model, template.replace(qpos=position(back))), qvel, ends)
+        return distance[guard], timestep * speed[guard]
 
     def since(distance: Array, travel: Array, curvature: Array) -> tuple[Array, Array]:
         """Share of a step since the distance was zero, and the travel at that time."""
@@ -223,17 +243,17 @@ def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event
 
     zero, tiny = jnp.zeros_like(qpos, shape=()), jnp.finfo(qpos.dtype).tiny
     inside = jnp.where(ends, 1.0, zero)
-    known, (_, curvature), deep = jax.jvp(stage, (inside,), (-jnp.ones_like(zero),), has_aux=True)
+    known, (_, curvature) = jax.jvp(stage, (inside,), (-jnp.ones_like(zero),))
     distance, travel = known
     begun, _ = since(distance, travel, curvature)
     away = jnp.where(ends, jnp.maximum(distance / jnp.where(travel == 0, 1.0, travel), -1.0), jnp.minimum(begun, 1.0))
     away = (1 - NEAR_TOUCH) * away
-    at_back, near = stage(inside + away)
+    at_back = stage(inside + away)
     # MJX may report no contact close to the touch, or another one in its place.
     unexpected = jnp.abs(at_back[0] - (distance - travel * away + curvature * away**2 / 2))
     chosen = (at_back[0] < 0) & (unexpected < jnp.abs(distance) / 2)
     choose = lambda one, other: jax.tree.map(partial(jnp.where, chosen), one, other)  # noqa: E731
-    (distance, travel), positioned, back = choose((at_back, near, inside + away), (known, deep, inside))
+    (distance, travel), back = choose((at_back, inside + away), (known, inside))
     more, closing = since(distance, travel, curvature)
     share = back + jnp.where(ends, distance / jnp.where(travel == 0, 1.0, travel), more)
     travel = jnp.where(ends, travel, closing)
@@ -243,4 +263,4 @@ def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event
     last = jnp.where(passes, 2 * jnp.maximum(1 - share / length, 0.0) / length, 1 - share)
     moves = (distance < 0) & (share > 0) & (share < 1 - TOUCHING_SHARE) & (~ends | (travel > 0))
     before = jnp.where(passes | event.brief, 0.0, share)
-    return Touch(share, (last, before), travel, positioned, event.used & moves)
+    return Touch(share, (last, before), travel, position(back), event.used & moves)
