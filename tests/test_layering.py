@@ -28,6 +28,7 @@ LAYERS = [
     "mjx_study.reference",
     "mjx_study.graph",
     "mjx_study.simulation",
+    "mjx_study.identification",
     "mjx_study.options",
     "mjx_study.tasks",
     "mjx_study.authoring",
