@@ -3,12 +3,13 @@
 import json
 import math
 import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from experiments import ROOT
-from experiments.engines import catalog
+from experiments.engines import catalog, certify, references
 from experiments.engines.adapters import mujoco_family
 from experiments.engines.judge import combined, measure, verdict
 from experiments.engines.page import CELLS, PAGE, cells, tables
@@ -88,3 +89,32 @@ def test_free_flight_of_what_is_installed(name: str) -> None:
     assert np.allclose(position[:2], [0.1, 0], atol=1e-5) and abs(position[2] - z) < late
     assert np.isclose(value, SCENES["toss"].cost(np.array([position])), rtol=1e-5)
     assert np.isclose(derivative, SCENES["toss"].cost_gradient(np.array([position]))[0, 2], rtol=1e-4)
+
+
+def test_reference_gradients_are_certified_and_the_reader_recomputes_a_few() -> None:
+    index, entries = references.read(certify.STEM)
+    assert len(entries) >= 100 and not any(certify.faults(entry) for entry in entries)
+    for scene in index["scenes"]:
+        assert index["scenes"][scene] == certify.describe(scene)
+    for entry in entries[:: len(entries) // 6]:
+        scene, thetas = SCENES[entry["scene"]], np.array([entry["theta"]])
+        values, positions = certify.native(scene, entry["timestep"], thetas)
+        slopes = certify.central(scene, entry["timestep"], thetas)
+        found = {"value": values[0], "position": positions[0], "derivative": slopes[0]}
+        assert max(references.deviations(entry, found).values()) < 10, entry
+        assert references.deviations(entry, {"derivative": 1.01 * slopes[0]})["derivative"] > 10
+
+
+@pytest.mark.parametrize("name", references.NUMBERS)
+def test_a_number_that_ways_disagree_on_is_not_certified(name: str) -> None:
+    entry = references.read(certify.STEM)[1][0]
+    worse = entry["uncertainty"] | {name: abs(entry[name]) + abs(entry["value"])}
+    assert certify.faults(entry | {"uncertainty": worse}) == [name]
+
+
+def test_references_need_no_more_than_numpy() -> None:
+    script = "import sys; import references; print(sorted({'jax', 'mujoco', 'experiments'} & set(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=references.__file__.rpartition("/")[0], capture_output=True
+    )
+    assert done.stdout.strip() == b"[]", done.stderr

@@ -29,7 +29,8 @@ def main() -> None:
                 faint = 0.4 if verdict(cell) == "unknown" else 1.0
                 axes.barh(at, ratio, 0.38, color=f"C{i}", alpha=faint, label=f"{1000 * step:g} ms" if not row else None)
             else:
-                axes.text(1.1, at, "not shown: NaN, negative or above 12", va="center", fontsize=7)
+                missing = "not shown: NaN, negative or above 12" if cell else "not measured"
+                axes.text(1.1, at, missing, va="center", fontsize=7)
     axes.axvline(1, color="black", linewidth=1)
     axes.set_yticks(range(len(names)), [ENGINES[name].label for name in names])
     axes.invert_yaxis()

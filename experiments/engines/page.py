@@ -13,7 +13,7 @@ from experiments.pages import markdown_row
 
 CELLS: Final = DATA / "engines.jsonl"
 PAGE: Final = DOCS / "engines.md"
-SHOWN: Final = ("toss", "ball_wall")
+SHOWN: Final = ("toss", "ball_wall", "slide")
 """Scenes that are measured and shown."""
 
 Cells = Mapping[tuple[str, str, float], Mapping[str, Any]]
