@@ -1,16 +1,19 @@
-"""Table of docs/contact-models.md: the mean of first-order gradients of a toss under every contact law.
+"""Tables of docs/which-contact.md: what each contact law's first-order gradients cost and buy.
 
-    python -m experiments.laws
+    python -m experiments.laws             # measure what data/laws.jsonl lacks, with the extra `laws`; an hour
+    python -m experiments.laws page        # write the tables
 
-A few minutes on one core, with the extra `laws`. A ball of 1 kg slides at 1 m/s and falls at 1 m/s on a plane; its cost
-is quadratic in its final height and linear in its place. The gap is normal with a mean of 50 mm, and the slope of the
-mean cost over it is that of the sum over the score.
+All at MuJoCo's default stiffness: K is that of solref (0.02, 1) for the contact's effective mass. In `SCENES` noise
+acts on one number, and means are quadrature; in `SAMPLED` they are means over samples, along a direction of theta.
 """
 
-import dataclasses
+import itertools
+import json
+import sys
 import time
-from functools import partial
-from typing import Final
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -18,55 +21,330 @@ import mujoco
 import numpy as np
 
 import mjx_study as study
-from experiments.pages import markdown_row
-from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES
-from mjx_study.simulation.contact import ContactModel, apply_contact, contact_model
+from estimators import NOISES, first_order, zeroth_order
+from experiments import DATA, DOCS
+from experiments.pages import write_tables
+from mjx_study.choices import DEFAULT_SOLREF, FAMILIES
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.quadrature import Line, grid, means
+from mjx_study.objective import Simulator
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.runtime import configure
+from mjx_study.simulation.contact import (
+    ContactModel,
+    apply_contact,
+    cone_edges,
+    family_model,
+    stiffness_from_solref,
+)
 from mjx_study.simulation.dynamics import State, step
-from mjx_study.simulation.law import LAWS, make_law
-from mjx_study.simulation.scene import Scene, put_scene
+from mjx_study.simulation.engine import engine_model
+from mjx_study.simulation.law import LAWS as OTHERS
+from mjx_study.simulation.scene import put_scene
 from mjx_study.table import markdown_table
+from mjx_study.tasks import make_task
+from mjx_study.tasks.task import Task
 
-TIMESTEP, SECONDS, GAP, SPREAD, POINTS = 0.005, 0.4, 0.05, 0.005, 1000  # [s], [s], [m], [m]
-TOSSED: Final = f"""<mujoco><option timestep="{TIMESTEP}"/>
-  <worldbody><geom name="floor" type="plane" size="20 20 1" condim="3"/>
-  <body pos="0 0 0.1"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
-    <geom name="ball" size="0.1" mass="1" condim="3"/></body></worldbody></mujoco>"""
-X, Z = 0, 1
+CELLS: Final = DATA / "laws.jsonl"
+LAWS: Final = {
+    "MuJoCo's default": ("mujoco_default", "none"),
+    "with the onset term": ("mujoco_default", "linear"),
+    **{name: (name, "none") for name in ("smooth_onset", "penalty", *OTHERS)},
+}
+"""Contact family and onset term by the name of a row."""
+FEW, MANY, CHUNK = 400, 4000, 250  # points, samples and pairs of other laws and of MuJoCo's
+TIMESTEP, GAP, SPREAD = 0.005, 0.05, 0.005  # [s], [m], [m]
+SPEED, FRICTION, GRAVITY = 1.0, 1.0, 9.81  # [m/s], -, [m/s^2]
+SLOPE: Final = 0.5
+"""Of the ground on which a ball of friction 1 rests."""
+STEPS: Final = (0.001, 0.002, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08)
+ZEROTH: Final = "MuJoCo's default, zeroth order"
+THROWN: Final = """<mujoco><option timestep="{}"/><worldbody><geom name="floor" type="plane" size="20 20 1" condim="3"/>
+  <body pos="0 0 0.1"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>{}</body></worldbody>
+  </mujoco>"""
+GEOMS: Final = {
+    "ball": '<geom name="thrown" size="0.1" mass="1" condim="3"/>',
+    "box": '<joint axis="0 1 0"/><geom name="thrown" type="box" size="0.2 0.2 0.1" mass="1" condim="3"/>',
+}
 
 
-def toss(scene: Scene, contact: ContactModel, gap: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the cost of a fall through a gap [m], and the largest relative residual of the solver."""
-    model, rest = apply_contact(scene.model, contact), study.initial_state(scene)
-    height = rest.qpos[Z]
-    start = dataclasses.replace(rest, qpos=rest.qpos.at[Z].add(gap), qvel=rest.qvel.at[X].set(1.0).at[Z].set(-1.0))
+def thrown(name: str, geom: str, horizon: int, start: Callable[[State, Any], State], at: float, sigma: float, cost):
+    """Return a task of one number that sets the start of a ball or box above the ground."""
+    scene = put_scene(mujoco.MjModel.from_xml_string(THROWN.format(TIMESTEP, GEOMS[geom])), name)
+    return study.Task(
+        name=name,
+        scene=scene,
+        horizon=horizon,
+        policy=study.InitialStatePolicy(1, horizon, 0, start),
+        theta=jnp.full(1, at),
+        sigma=sigma,
+        start=study.initial_state(scene),
+        final_cost=cost,
+        contact_pair=("thrown", "floor"),
+    )
 
-    def advance(state: State, _: None) -> tuple[State, jax.Array]:
-        return step(scene, model, state, jnp.zeros(0))
 
-    last, residuals = jax.lax.scan(advance, start, None, length=round(SECONDS / TIMESTEP))
-    above = last.qpos[Z] - height
-    return 100 * above**2 + last.qpos[X] + above + 0.1, residuals.max()
+def toss() -> Task:
+    """A ball falls through a gap [m] at 1 m/s down and along."""
+    moving = jnp.array([SPEED, -SPEED])
+    start = lambda rest, gap: State(rest.qpos.at[1].set(gap[0]), moving, rest.act, rest.warmstart)  # noqa: E731
+    return thrown("toss", "ball", 80, start, GAP, SPREAD, lambda last: 100 * last.qpos[1] ** 2 + last.qpos.sum())
+
+
+def box() -> Task:
+    """A box tilted by 0.2 rad falls onto an edge, then the other; the gap [m] is below the first."""
+    lower = 0.2 * np.sin(0.2) + 0.1 * np.cos(0.2) - 0.1
+    moving = jnp.array([SPEED / 2, -SPEED, 0.0])
+
+    def start(rest: State, gap: jax.Array) -> State:
+        return State(jnp.stack([0.0, gap[0] + lower, 0.2]), moving, rest.act, rest.warmstart)
+
+    return thrown("box", "box", 80, start, GAP, SPREAD, lambda last: 100 * last.qpos[1] ** 2 + last.qpos.sum())
+
+
+def slide() -> Task:
+    """A ball that cannot turn slides to rest from a speed [m/s]; the cost is its way [m]."""
+    start = lambda rest, speed: State(rest.qpos, rest.qvel.at[0].set(speed[0]), rest.act, rest.warmstart)  # noqa: E731
+    return thrown("slide", "ball", 60, start, SPEED, 0.1 * SPEED, lambda last: last.qpos[0])
+
+
+SCENES: Final = {"toss": toss, "slide": slide, "box": box, "ball_wall": lambda: make_task("ball_wall")}
+SAMPLED: Final = ("pusher", "tennis")
+TRAINED: Final = {
+    "pusher": {"iterations": 200, "samples": (10,)},
+    "ball_wall": {"iterations": 40, "samples": (30,), "learning_rate": 1.0},
+}
+SEEDS, DRAWS = 3, 1000
+
+
+def member(task: Task, family: str, scale: float = 1.0) -> ContactModel:
+    """Return the contact model of a family at MuJoCo's default stiffness; `scale` multiplies its smoothing."""
+    of = FAMILIES[family]
+    assert task.contact_pair is not None
+    given: dict[str, Any] = {"effective_mass": task.effective_mass, "edges": cone_edges(task.scene, *task.contact_pair)}
+    if of.swept:
+        given["stiffness"] = stiffness_from_solref(DEFAULT_SOLREF, effective_mass=task.effective_mass)[0]
+        given["damping"] = None if of.dampratio or of.smoothing else task.defaults.damping
+    return family_model(family, task.scene, smoothing=of.smoothing * scale or None, **given)
+
+
+@cache
+def line(scene: str, onset: str) -> tuple[Task, Line]:
+    """A scene's task, and its cost and derivative, compiled once for all contacts of a law."""
+    task = SCENES[scene]().replace(onset=onset)
+    return task, Line(task)
+
+
+def integrated(scene: str, family: str, onset: str, scale: float = 1.0) -> dict[str, Any]:
+    """Slope of the mean cost, mean of the derivative, their errors, deviations of one sample, and time."""
+    task, costs = line(scene, onset)
+    contact, position = member(task, family, scale), np.asarray(task.theta, float)
+    points = grid(position[0], position[0], task.sigma, FEW if family in OTHERS else MANY, task.noise)
+    values, slopes = costs(points, contact)
+    begin = time.perf_counter()
+    costs(points[:CHUNK], contact)
+    took = (time.perf_counter() - begin) / CHUNK
+    found, w = means(points, values, slopes, position, task.sigma, task.noise), (points - position[0]) / task.sigma
+    weights = NOISES[task.noise].density(w)
+    zeroth = (values - np.interp(position[0], points, values)) * w / task.sigma
+    spread = [np.average((each - np.average(each, weights=weights)) ** 2, weights=weights) for each in (zeroth, slopes)]
+    mean = {name: getattr(found, name)[0] for name in ("smoothed", "slope", "slope_error", "first", "first_error")}
+    return mean | {"zeroth_sd": spread[0] ** 0.5, "first_sd": spread[1] ** 0.5, "seconds": took}
+
+
+def sampled(name: str, family: str, onset: str) -> dict[str, Any]:
+    """The same from samples; errors are standard errors."""
+    task = make_task(name).replace(onset=onset)
+    objective = Simulator(task, CHUNK).objective(member(task, family))
+    along = (
+        np.random.default_rng(1).normal(size=task.policy.num_params) if name == "tennis" else np.ones(task.theta.size)
+    )
+    along /= np.linalg.norm(along)
+    size = FEW if family in OTHERS else MANY
+    keys, pairs = (jax.random.split(jax.random.key(seed), size) for seed in range(2))
+    reach = task.sigma / 2
+    below, above = (np.asarray(objective.evaluate(task.theta + t * along, pairs).value) for t in (-reach, reach))
+    zeroth = np.asarray(zeroth_order(objective.evaluate(task.theta, keys), "zero_noise").per_sample)
+    differentiate = objective.differentiate if onset == "none" else objective.differentiate_corrected
+    first = np.asarray(first_order(differentiate(task.theta, keys)).per_sample)
+    begin = time.perf_counter()
+    jax.block_until_ready(differentiate(task.theta, keys[:CHUNK]))
+    took = (time.perf_counter() - begin) / CHUNK
+    slope, mean = (above - below) / (2 * reach), first @ along
+    errors = (np.std(each, ddof=1) / len(each) ** 0.5 for each in (slope, mean))
+    found = dict(zip(("slope_error", "first_error"), errors, strict=True))
+    found |= {
+        name: float(np.var(each, axis=0).sum() ** 0.5) for name, each in (("zeroth_sd", zeroth), ("first_sd", first))
+    }
+    return found | {"slope": slope.mean(), "first": mean.mean(), "seconds": took}
+
+
+def faithful(family: str) -> dict[str, Any]:
+    """What a ball of the toss does: at rest, on a slope, as it lands and slides; and the steps that it bears."""
+    task = toss()
+    contact, still = member(task, family), study.initial_state(task.scene)
+
+    def way(timestep, tilt, height, velocity):
+        model = apply_contact(task.scene.model, contact)
+        pull = GRAVITY * jnp.stack([tilt, 0.0, -1.0])
+        model = model.replace(opt=model.opt.replace(timestep=timestep, gravity=pull))
+        start = State(still.qpos.at[1].set(height), velocity, still.act, still.warmstart)
+
+        def advance(at: State, _: None) -> tuple[State, Any]:
+            after = step(task.scene, model, at, jnp.zeros(0))[0]
+            return after, (after.qpos, after.qvel)
+
+        return jax.lax.scan(advance, start, None, length=1000)[1]
+
+    cases = [(0.002, 0.0, 0.0, 0, 0), (0.002, SLOPE, 0.0, 0, 0), (0.002, 0.0, 0.05, 0, -SPEED), (0.002, 0, 0, SPEED, 0)]
+    cases += [(each, 0.0, 0.01, 0.0, -SPEED) for each in STEPS]
+    timestep, tilt, height, *velocity = np.array(cases, float).T
+    qpos, qvel = map(np.asarray, jax.jit(jax.vmap(way))(timestep, tilt, height, np.stack(velocity, axis=1)))
+    touched = np.argmax(qvel[2, :, 1] > -0.9 * SPEED)
+    energy = GRAVITY * qpos[4:, :, 1] + (qvel[4:] ** 2).sum(axis=-1) / 2
+    bears = np.all(energy < 2 * (GRAVITY * 0.01 + SPEED**2 / 2), axis=1)  # False where it is NaN
+    return {
+        "penetration": -qpos[0, -1, 1],
+        "creep": qvel[1, -1, 0],
+        "creep_gain": qvel[1, -1, 0] - qvel[1, -501, 0],
+        "restitution": qvel[2, touched:, 1].max() / (SPEED**2 + 2 * GRAVITY * 0.05) ** 0.5,
+        "way": qpos[3, -1, 0],
+        "rest": abs(qvel[3, -1, 0]),
+        "first_bad_step": min((each for each, good in zip(STEPS, bears, strict=True) if not good), default=np.inf),
+    }
+
+
+def trained(name: str, family: str, onset: str, estimator: str) -> dict[str, Any]:
+    """Costs of the policies that descents reach under a law, and of the same in the C engine with MuJoCo's default."""
+    task, of = make_task(name), FAMILIES[family]
+    given: dict[str, Any] = dict(TRAINED[name])
+    if of.swept:
+        given["stiffness"] = (stiffness_from_solref(DEFAULT_SOLREF, effective_mass=task.effective_mass)[0],)
+        given["damping"] = None if of.dampratio or of.smoothing else task.defaults.damping
+    about = StudyConfig(
+        kind="descents", tasks=(name,), contact=(family,), estimators=(estimator,), seeds=SEEDS, onset=onset, **given
+    )
+    begin = time.perf_counter()
+    found = run_study(about)
+    took = time.perf_counter() - begin
+    engine = [executed(task, each) for each in np.asarray(found["theta"]).reshape(SEEDS, -1)]
+    own = np.asarray(found["final_cost"]).ravel().tolist()
+    return {"own": own, "engine": engine, "start": executed(task, np.asarray(task.theta)), "seconds": took}
+
+
+def executed(task: Task, theta: np.ndarray) -> float:
+    """Mean cost over noise of a policy without feedback, executed by the C engine with MuJoCo's default."""
+    host = engine_model(task.scene, member(task, "mujoco_default"))
+    drawn = task.sigma * np.random.default_rng(0).standard_normal((DRAWS, *task.policy.noise_shape))
+    first, inputs = jax.vmap(
+        lambda noise: (task.policy.place(theta, noise, task.start), task.policy.feedforward(theta, noise))
+    )(jnp.asarray(drawn))
+    qpos = np.zeros((DRAWS, task.horizon + 1, host.nq))
+    qvel, controls = np.zeros((DRAWS, task.horizon + 1, host.nv)), np.asarray(inputs)
+    for draw in range(DRAWS):
+        data = mujoco.MjData(host)
+        data.qpos[:], data.qvel[:] = first.qpos[draw], first.qvel[draw]
+        for index in range(task.horizon + 1):
+            qpos[draw, index], qvel[draw, index] = data.qpos, data.qvel
+            if index < task.horizon:
+                data.ctrl[:] = controls[draw, index]
+                mujoco.mj_step(host, data)
+    running, final = task.costs()
+
+    def cost(qpos, qvel, controls):
+        states = jax.vmap(lambda q, v: State(q, v, task.start.act, task.start.warmstart))(qpos, qvel)
+        each = jax.vmap(running)(jax.tree.map(lambda leaf: leaf[:-1], states), controls)
+        return each.sum() + final(jax.tree.map(lambda leaf: leaf[-1], states))
+
+    return float(jax.jit(jax.vmap(cost))(qpos, qvel, controls).mean())
+
+
+def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
+    """What is measured, by scene and row."""
+    found: dict[tuple[str, str], Callable[[], dict[str, Any]]] = {}
+    for scene, (row, each) in itertools.product(("toss", "faithful", "ball_wall"), LAWS.items()):
+        found[scene, row] = partial(faithful, each[0]) if scene == "faithful" else partial(integrated, scene, *each)
+    for name in TRAINED:
+        for row, each in LAWS.items():
+            found[f"train {name}", row] = partial(trained, name, *each, "fobg")
+        found[f"train {name}", ZEROTH] = partial(trained, name, *LAWS["MuJoCo's default"], "zobg")
+        for row, each in LAWS.items() if name == "ball_wall" else ():
+            found["pusher", row] = partial(sampled, "pusher", *each)
+    for row, scale in itertools.product(("log_barrier", "hunt_crossley"), (0.1, 10.0)):
+        found[f"toss, kappa {scale:g}", row] = partial(integrated, "toss", row, "none", scale)
+    for scene, (row, each) in itertools.product(("slide", "tennis", "box"), LAWS.items()):
+        found[scene, row] = partial(sampled if scene in SAMPLED else integrated, scene, *each)
+    for row, scale in itertools.product(("kelvin_voigt", "conic"), (0.1, 10.0)):
+        found[f"toss, kappa {scale:g}", row] = partial(integrated, "toss", row, "none", scale)
+    return found
+
+
+def measured() -> dict[tuple[str, str], dict[str, Any]]:
+    """The numbers of data/laws.jsonl by scene and row."""
+    lines = CELLS.read_text().splitlines() if CELLS.exists() else []
+    return {(each.pop("scene"), each.pop("row")): each for each in map(json.loads, lines)}
+
+
+def measure(only: list[str]) -> None:
+    """Append what is missing, of the scenes named or all."""
+    known = measured()
+    for (scene, row), compute in cells().items():
+        if (scene, row) in known or (only and scene not in only):
+            continue
+        begin = time.perf_counter()
+        try:
+            numbers = compute()
+        except ValueError as error:
+            numbers = {"refused": str(error)}
+        numbers = {
+            name: float(each) if np.ndim(each) == 0 and name != "refused" else each for name, each in numbers.items()
+        }
+        with CELLS.open("a") as file:
+            file.write(json.dumps({"scene": scene, "row": row, **numbers}) + "\n")
+        print(f"{scene}, {row}: {time.perf_counter() - begin:.0f} s", flush=True)
+
+
+def tables() -> dict[str, str]:
+    """The tables of the page; a dash where nothing was measured."""
+    found = measured()
+
+    def cell(scene: str, row: str, say: Callable[[dict[str, Any]], str]) -> str:
+        numbers = found.get((scene, row), {})
+        return "refused" if "refused" in numbers else say(numbers) if numbers else "-"
+
+    def bias(of: dict[str, Any]) -> str:
+        error = (of["first_error"] + of["slope_error"]) / abs(of["slope"])
+        return f"{100 * (of['first'] / of['slope'] - 1):+.1f} ± {100 * error:.1g} %"
+
+    def deviation(of: dict[str, Any]) -> str:
+        return f"{of['first_sd'] / of['zeroth_sd']:.2g}"
+
+    means = [
+        [row, *(cell(scene, row, say) for scene in ("toss", "ball_wall") for say in (bias, deviation))]
+        + [cell("toss", row, lambda of: f"{1e3 * of['seconds']:.2g}")]
+        for row in LAWS
+    ]
+    says: dict[str, Callable[[dict[str, Any]], str]] = {
+        "depth at rest [mm]": lambda of: f"{1e3 * of['penetration']:.2g}",
+        "creep [mm/s]": lambda of: "slides" if of["creep_gain"] > 0.1 else f"{1e3 * of['creep']:.2g}",
+        "restitution": lambda of: f"{abs(of['restitution']):.2f}",
+        "way [mm]": lambda of: "slides" if of["rest"] > 0.1 else f"{1e3 * of['way']:.1f}",
+        "stable below [ms]": lambda of: "> 80" if of["first_bad_step"] > 1 else f"{1e3 * of['first_bad_step']:.0f}",
+    }
+    plain = [row for row, (_, onset) in LAWS.items() if onset == "none"]
+    fidelity = [[row, *(cell("faithful", row, say) for say in says.values())] for row in plain]
+    headers = ("law", "toss: bias", "sd / ZoBG's", "ball_wall: bias", "sd / ZoBG's", "ms per gradient")
+    rows = {"gradients": (headers, means), "fidelity": (("law", *says), fidelity)}
+    return {name: markdown_table(lines, header) for name, (header, lines) in rows.items()}
 
 
 def main() -> None:
-    """Print the table."""
-    jax.config.update("jax_enable_x64", True)
-    scene = put_scene(mujoco.MjModel.from_xml_string(TOSSED), "toss")
-    usual = contact_model(DEFAULT_SOLREF, DEFAULT_SOLIMP, scene=scene)
-    gaps = 2 * GAP * (np.arange(POINTS) + 0.5) / POINTS
-    score = (gaps - GAP) / SPREAD
-    weights = np.exp(-(score**2) / 2) / np.exp(-(score**2) / 2).sum()
-    print(markdown_table([], ("law", "slope", "E[FoBG]", "residual", "ms per gradient")))
-    for name in (None, *LAWS):
-        contact = dataclasses.replace(usual, law=None if name is None else make_law(name, FAMILIES[name].smoothing))
-        run = jax.jit(jax.vmap(jax.value_and_grad(partial(toss, scene, contact), has_aux=True)))
-        jax.block_until_ready(run(gaps))
-        begin = time.perf_counter()
-        (costs, residuals), slopes = jax.device_get(run(gaps))
-        numbers = (weights * costs * score).sum() / SPREAD, (weights * slopes).sum()
-        took = 1e3 * (time.perf_counter() - begin) / POINTS
-        row = (*(f"{each:.4f}" for each in numbers), f"{residuals.max():.0e}", f"{took:.2f}")
-        print(markdown_row(name or "MuJoCo's default", *row), flush=True)
+    """Run the command line."""
+    if sys.argv[1:] == ["page"]:
+        write_tables(DOCS / "which-contact.md", tables())
+        return
+    configure(cpu_devices=1)
+    measure(sys.argv[1:])
 
 
 if __name__ == "__main__":

@@ -39,6 +39,8 @@ STIFFNESS_SCALE: Final = 100.0
 """MuJoDiCo's stiffness [N/m] over MuJoCo's k / d_width^2 [1/s^2]."""
 BUDGET: Final = {"tolerance": 1e-12, "iterations": 50, "ls_tolerance": 1e-12, "ls_iterations": 50}
 """Of MuJoDiCo's solvers, whose derivative is only as good as their solution [m/s for the first]."""
+CONE_FLOOR: Final = 1e-14
+"""In place of MuJoDiCo's 1e-8, in float64, with which the derivative of `conic` is off by 2e-3."""
 FLAGS_OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 Step = tuple[Array, Array, Array, Array, Array]
@@ -120,7 +122,9 @@ class MujodicoLaw(Law):
         dry = host.dof_frictionloss.any() or host.tendon_frictionloss.any()
         lacking = {
             "RK4: choose the integrator euler or implicitfast": host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4,
-            "elliptic cones: choose --cone pyramidal": self.name == "log_barrier" and elliptic and condims - {1},
+            "elliptic cones: choose --cone pyramidal": self.name in ("log_barrier", "conic")
+            and elliptic
+            and condims - {1},
             "frictionloss of joints and tendons: remove it": self.name == "conic" and dry,
         }
         for what, present in lacking.items():
@@ -159,6 +163,11 @@ def _package(name: str) -> Any:
         from mujodico import mjx as mujodico
     except ImportError as error:
         raise ValueError(f"{name} {INSTALL} ({error})") from None
+    from mujodico.mjx._src import conic_solver
+
+    if jax.config.jax_enable_x64 and not isinstance(conic_solver.Context, functools.partial):
+        # The derivative of the cone is one solve with a matrix that has 100 of these, relatively, on its diagonal
+        conic_solver.Context = functools.partial(conic_solver.Context, _EPS=CONE_FLOOR)
     return mujodico
 
 
