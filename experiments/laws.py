@@ -232,12 +232,13 @@ def trained(name: str, family: str, onset: str, estimator: str) -> dict[str, Any
     return {"own": own, "engine": engine, "start": executed(task, np.asarray(task.theta)), "seconds": took}
 
 
-def executed(task: Task, theta: np.ndarray) -> float:
+def executed(task: Task, theta: Any) -> float:
     """Mean cost over noise of a policy without feedback, executed by the C engine with MuJoCo's default."""
     host = engine_model(task.scene, member(task, "mujoco_default"))
     drawn = task.sigma * np.random.default_rng(0).standard_normal((DRAWS, *task.policy.noise_shape))
+    start: Any = task.start
     first, inputs = jax.vmap(
-        lambda noise: (task.policy.place(theta, noise, task.start), task.policy.feedforward(theta, noise))
+        lambda noise: (task.policy.place(theta, noise, start), task.policy.feedforward(theta, noise))
     )(jnp.asarray(drawn))
     qpos = np.zeros((DRAWS, task.horizon + 1, host.nq))
     qvel, controls = np.zeros((DRAWS, task.horizon + 1, host.nv)), np.asarray(inputs)

@@ -29,7 +29,7 @@ SMALL = {
     "4_are_mjx_gradients_right": (
         "STATES, STEPS, FORCES, POINTS = 1, 5, 3, 3\nCONTACT, HORIZON = ('mujoco_default', 'smooth_onset'), 190"
     ),
-    "5_identify_contact": "TOSSES, STEPS = 2, 120",
+    "5_identify_contact": "TOSSES, STEPS = 2, 60",
 }
 """Parameters of a short run."""
 ABSOLUTE = re.compile(r"(?<![\w.~])/(?:home|root|Users|tmp|var|usr|opt|mnt|srv|private|proc)/|[A-Z]:\\\\")

@@ -165,7 +165,7 @@ def _package(name: str) -> Any:
         raise ValueError(f"{name} {INSTALL} ({error})") from None
     from mujodico.mjx._src import conic_solver
 
-    if jax.config.jax_enable_x64 and not isinstance(conic_solver.Context, functools.partial):
+    if jax.config.values["jax_enable_x64"] and not isinstance(conic_solver.Context, functools.partial):
         # The derivative of the cone is one solve with a matrix that has 100 of these, relatively, on its diagonal
         conic_solver.Context = functools.partial(conic_solver.Context, _EPS=CONE_FLOOR)
     return mujodico
