@@ -17,6 +17,7 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED
+from mjx_study.simulation.observation import observed
 from mjx_study.simulation.scene import Scene, load_scene, put_scene
 from tests.scenes import compiled
 
@@ -107,6 +108,27 @@ def test_steps_are_the_engines_and_derivatives_those_of_the_values() -> None:
             for adjoint, one, other in zip(adjoints, (high.qpos, high.qvel), (low.qpos, low.qvel), strict=True)
         )
         np.testing.assert_allclose(np.sum(direction * found, axis=1), slopes, rtol=1e-5, atol=1e-6)
+
+
+def test_what_costs_ask_for_is_computed_natively() -> None:
+    """Through XLA, every quantity that a cost reads would bring MJX's whole kinematics into a rollout's program."""
+    scene, (qpos, qvel, *_) = one_leg(), states(one_leg().host)
+
+    def seen(qpos, qvel):
+        state = observed(scene, State(qpos, qvel, jnp.zeros(0), jnp.zeros_like(qvel)))
+        return state.xpos, state.geom_xlinvel
+
+    program = str(jax.make_jaxpr(seen)(qpos[0], qvel[0]))
+    assert program.count("native[") == 2 and "dot_general" not in program
+    positions, velocities = jax.jit(jax.vmap(seen))(qpos, qvel)
+    for at in range(SAMPLES):
+        data = mujoco.MjData(scene.host)
+        data.qpos, data.qvel, velocity = qpos[at], qvel[at], np.zeros(6)
+        mujoco.mj_forward(scene.host, data)
+        np.testing.assert_allclose(positions[at], data.xpos, rtol=0, atol=1e-12)
+        for geom, found in enumerate(velocities[at]):
+            mujoco.mj_objectVelocity(scene.host, data, mujoco.mjtObj.mjOBJ_GEOM, geom, velocity, 0)
+            np.testing.assert_allclose(found, velocity[3:], rtol=0, atol=1e-10)
 
 
 def last(qvel: Any, control: Any, qpos: Any) -> mjx.Data:

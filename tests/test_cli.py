@@ -187,10 +187,6 @@ def test_an_output_folder_that_is_a_file(capsys: pytest.CaptureFixture[str], tmp
     assert path.read_text() == "mine"
 
 
-def test_an_output_folder_that_cannot_be_written(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "cannot write to the output folder" in refused(capsys, "compare", "pusher", "--output", "/proc/results")
-
-
 def test_the_log_level_of_xla_is_the_users_where_it_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
     for given, found in ((None, "3"), ("0", "0")):
         monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", given or "")

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager, suppress
 from http.client import HTTPException
@@ -133,16 +132,6 @@ def test_a_local_cluster_leaves_nothing_behind(tmp_path: Path, ended_by: signal.
     assert list(scratch.iterdir()) == []
 
 
-def test_a_cell_goes_where_its_program_is() -> None:
-    """A worker keeps to what it has; a new one compiles only where there is enough to do."""
-    waiting = {"a": deque(range(9)), "b": deque(range(3)), "c": deque([1])}
-    has = {"a": {"w1", "w2"}, "b": {"w3"}, "c": {"w1", "w4"}}
-    assert cluster._program_for("w3", waiting, has) == ["b"]
-    assert cluster._program_for("w1", waiting, has) == ["a"]
-    assert cluster._program_for("new", waiting, has) == ["a"]
-    assert cluster._program_for("w4", {"a": deque([1, 2]), "c": deque()}, has) == []
-
-
 def test_a_cluster_needs_a_folder() -> None:
     with pytest.raises(ValueError, match="a cluster needs a folder"):
         run_study(config(1.0), cluster="local:1")
@@ -156,18 +145,6 @@ def test_a_worker_simulates_the_same_bits(workers: Any, tmp_path: Path) -> None:
         asked = config(1.0, 2.0, 3.0, tasks=("tests.carts:walled_cart",), contact=("penalty",), chunk_size=4, **changes)
         here = run_study(asked, tmp_path / f"{name} here")
         assert same(run_study(asked, tmp_path / f"{name} there", cluster=workers), here)
-
-
-def test_each_worker_has_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By its number; one that has none, or a machine of one GPU, leaves the choice to JAX."""
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    monkeypatch.setattr(cluster, "glob", lambda pattern: ["/dev/nvidia1", "/dev/nvidia0"])
-    assert [cluster._gpu(name) for name in (0, 1, 2, "SLURMCluster-0-1")] == ["0", "1", "0", "1"]
-    assert cluster._gpu("tcp://node-1:8786") is None
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6,7")
-    assert cluster._gpu(4) == "6"
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4")
-    assert cluster._gpu(0) is None
 
 
 def test_the_example_files_are_sound() -> None:

@@ -1,9 +1,5 @@
 """Progress on standard error: a sign of life after each silence, counters that never run backwards, names of builds."""
 
-import os
-import re
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import Future
@@ -102,26 +98,3 @@ def test_jax_says_what_it_builds(monkeypatch: pytest.MonkeyPatch, capsys: pytest
         assert not activity.describe().startswith("tracing")
     assert seen == ["tracing rollouts, 1 s"]
     assert "[0/1] a stage" in capsys.readouterr().err
-
-
-SILENT = """
-import time
-from mjx_study.cli import output
-with output.computing() as progress:
-    progress(0, 3, "a stage")
-    time.sleep(13)
-"""
-
-
-def test_lines_come_as_the_time_passes() -> None:
-    """In a process of its own, on the real clock."""
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(
-        [sys.executable, "-c", SILENT], stderr=subprocess.PIPE, text=True, env=environment
-    ) as running:
-        assert running.stderr is not None
-        arrivals = [(time.monotonic(), line) for line in running.stderr]
-        assert running.wait() == 0
-    times = [time for time, _ in arrivals]
-    assert len(times) >= 3 and max(later - earlier for earlier, later in zip(times, times[1:], strict=False)) < 10
-    assert all(re.match(r" *\d+\.\d s  (\[0/3\] a stage|computing, 0 of 3)\n", line) for _, line in arrivals)

@@ -14,6 +14,7 @@ import pytest
 from mjx_study.simulation import constraint, dynamics
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact, contact_model
+from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.integration import integrate_position
 from mjx_study.simulation.scene import Scene
 from tests.scenes import (
@@ -376,6 +377,23 @@ def test_derivative_over_stiffness_without_damping() -> None:
     assert np.isfinite(derivative).all()
     numeric = central_jacobian(by_stiffness, np.zeros(1), 1.0)
     np.testing.assert_allclose(derivative[:, 0], numeric[:, 0], rtol=1e-8, atol=1e-14)
+
+
+@pytest.mark.parametrize("ends", [(0.6, 0.6), (0.9, 0.3)], ids=["constant", "falling"])
+def test_an_impedance_that_does_not_rise(ends: tuple[float, float]) -> None:
+    """Where MJX clips it: a constant one has one-sided slopes there, and a falling one another value than in C."""
+    program, values = over_parameters("pyramidal"), parameters((-3000.0, -40.0))
+    values[2:4], point = ends, at(-0.0004)
+    velocity, derivative = program(values, point)
+    numeric = central_jacobian(lambda change: program(values + change, point)[0], np.zeros(10), 1e-4)
+    np.testing.assert_allclose(derivative[:, 2:4], numeric[:, 2:4], rtol=1e-6, atol=1e-10)
+    assert np.abs(numeric[:, 2:4]).min(axis=1).max() > 1e-4
+    scene = sliding()
+    host = engine_model(scene, contact_model(*(part.tolist() for part in np.split(values, [2, 7])), scene=scene))
+    data = mujoco.MjData(host)
+    data.qpos, data.qvel = point[:3], point[3:]
+    mujoco.mj_step(host, data)
+    np.testing.assert_allclose(velocity, data.qvel, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -78,7 +78,7 @@ print(json.dumps([found.positions[0, 0].tolist(), float(found.values[0]), float(
 """
 
 
-@pytest.mark.parametrize("name", ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap"])
+@pytest.mark.parametrize("name", ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap", "nimble"])
 def test_free_flight_of_what_is_installed(name: str) -> None:
     engine = catalog.ENGINES[name]
     python = catalog.interpreter(engine)

@@ -12,16 +12,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from estimators import ESTIMATORS, Estimator
+from estimators import ESTIMATORS
 from mjx_study._matplotlib import matplotlib
 from mjx_study.plots.edges import UNDRAWN
 from mjx_study.plots.panels import UNSTABLE, counted
-from mjx_study.plots.study import MOST_DECADES, plot_study
-from mjx_study.plots.style import STYLES, combines, fit_to_paper, mark_clipped, style_of
+from mjx_study.plots.study import plot_study
+from mjx_study.plots.style import STYLES, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report
 from mjx_study.results.kind import find_kind
 from mjx_study.results.variables import CELL, ONSETS
-from mjx_study.storage.manifest import describe_estimator
 
 OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
 MASS, TIMESTEP = 0.05, 0.01  # kg, s: an undamped spring is unstable from 2000 N/m on
@@ -223,17 +222,6 @@ def test_unstable_steps_are_shown_wherever_the_axis_is_stiffness() -> None:
     assert hatched == [(2, 0), (2, 1)] and UNSTABLE in legend_of(chart)
 
 
-@pytest.mark.parametrize(
-    ("least", "greatest", "extend"), [(0, 0, "neither"), (-1, 0, "min"), (0, 1, "max"), (-1, 1, "both")]
-)
-def test_a_map_says_where_its_colours_end(least: int, greatest: int, extend: str) -> None:
-    powers = [10.0 ** (each * (MOST_DECADES + 2)) for each in (least, 0, greatest)]
-    values = xr.where(along("estimator", 0, 1, 0) == 1, along("model", *powers), 1.0)
-    swept = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
-    figure = plot_study(study("gradients", swept, 3, (0.1, 1.0), variance=values))["map_stiffness_sigma"]
-    assert figure.axes[-1]._colorbar.extend == extend  # type: ignore[attr-defined]
-
-
 def test_negative_costs_have_no_ratio_and_no_map() -> None:
     for cost, drawn in ((0.5, True), (-0.5, False)):
         figures = plot_study(study("descents", [("penalty", 10.0), ("penalty", 100.0)], 1, (0.1, 1.0), final_cost=cost))
@@ -284,39 +272,6 @@ def test_a_report_shows_what_there_is_and_once() -> None:
     )
     assert 'name="viewport"' in page and "prefers-color-scheme: dark" in page
     assert "<td>gamma</td>" in page and "<td>theta</td>" not in page and "<td>direction</td>" not in page
-
-
-class Both(Estimator):
-    """Somebody's own, of two batches."""
-
-    name = "both"
-    needs = ("evaluation", "differentiation")
-
-    def combine(self, *args: Any, **kwargs: Any) -> Any:
-        raise NotImplementedError
-
-
-def test_an_estimator_of_two_batches_is_hollow_and_dashed_whoever_wrote_it() -> None:
-    both = f"{__name__}:Both"
-    described = {both: describe_estimator(Both())}
-    assert [combines(name, described) for name in ("aobg", "ivw_h", both)] == [True] * 3
-    assert not any(combines(name, described) for name in ("zobg", "fobg", "nowhere_to_be_found:It"))
-    models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
-    for kind, labels in (("descents", ("AoBG", "FoBG")), ("landscapes", ("mean of AoBG", "mean of FoBG"))):
-        figure = list(plot_study(study(kind, models)).values())[-1]
-        styles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
-        assert [styles[each].get_linestyle() for each in labels] == ["--", "-"]
-        assert styles[labels[0]].get_markerfacecolor() == "none"
-        assert len({str(styles[each].get_markevery()) for each in labels}) == 2  # at different points
-
-
-@pytest.mark.parametrize("models", [[("penalty", 10.0), ("penalty", 100.0)], [("penalty", 10.0), ("mujoco", 10.0)]])
-def test_bounds_of_a_bias_are_side_by_side(models: list[tuple[str, float]]) -> None:
-    figure = plot_study(study("gradients", models, 3, squared_bias=0.0, squared_bias_se=0.1))["bias"]
-    bounds = [
-        line.get_xdata() for line in figure.axes[0].lines if line.get_marker() == "v" and np.size(line.get_xdata())
-    ]
-    assert len(bounds) == len({float(x[0]) for x in bounds}) == len(BOTH)  # type: ignore[index]
 
 
 def test_any_name_of_a_task_can_be_written() -> None:

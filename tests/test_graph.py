@@ -73,6 +73,7 @@ FUNCTIONS = {
     "index beyond the end": lambda x: jnp.take(x, jnp.array([1, 7]), mode="clip"),
     "add to one place twice": lambda x: jnp.zeros((3, 3)).at[jnp.array([0, 2, 0])].add(x[:, None]).at[1, 2].set(x[0]),
     "set beyond the end": lambda x: x.at[jnp.array([1, 9])].set(4.0),
+    "multiply, raise and lower": lambda x: x.at[jnp.array([0, 2, 0])].mul(3.0).at[1:].max(0.2).at[:2].min(x[0]),
     "segments": lambda x: jax.ops.segment_sum(x, jnp.array([1, 1, 0]), 2),
     "pad, tile and stack": lambda x: (jnp.pad(x, (1, 2)), jnp.tile(x[::-1], 2), jnp.stack([x, -x], 1).T.reshape(-1)),
     "dynamic slices": lambda x: jax.lax.dynamic_update_slice(TABLE[0], jax.lax.dynamic_slice(x, (2,), (2,)), (0,)),

@@ -252,33 +252,3 @@ def test_a_killed_command_goes_on_to_the_same_data(cluster: list[str], tmp_path:
     assert last.returncode == 0, last.stderr
     assert cli.main([*ARGUMENTS, "--output", str(tmp_path / "undisturbed")]) == 0
     assert same(load_study(folder), load_study(tmp_path / "undisturbed"))
-
-
-PEAK = """
-import resource, sys
-from mjx_study.runtime import configure
-configure(cpu_devices=1)
-from mjx_study.experiment import sampling
-from mjx_study.experiment.plan import plan_study
-from tests.documents import numbers_of
-from tests.test_sweep_memory import Stub, config
-
-sampling.Simulator = Stub
-plan = plan_study(config(samples=(int(sys.argv[1]),), block_size=10_000, seeds=1, horizon=50))
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-numbers_of(plan)
-print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
-"""
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_samples() -> None:
-    """50 parameters, three estimators: 160,000 samples take what 40,000 do, and no more than the plan says."""
-    peak = []
-    for samples in ("40000", "160000"):
-        command = [sys.executable, "-c", PEAK, samples]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
-        assert done.returncode == 0, done.stderr
-        peak.append(float(done.stdout))
-    whole = planned(samples=(160_000,), block_size=None, horizon=50, seeds=1).memory / 1e9
-    assert peak[1] < 1.1 * peak[0] + 0.01 and peak[1] < whole / 4, (peak, whole)

@@ -225,32 +225,6 @@ def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: py
 
 
 @pytest.mark.slow
-def test_one_compilation_for_all_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
-    compiled: list[Any] = []
-    jit = jax.jit
-
-    def spy(function, *args, **kwargs):
-        compiled.append(jit(function, *args, **kwargs))
-        return compiled[-1]
-
-    programs: dict[str, Any] = {}
-
-    class Spied(descents.Compiled):
-        def __init__(self, function, name, *made_of):
-            super().__init__(function, name, *made_of)
-            programs[name] = self
-
-    monkeypatch.setattr(descents.jax, "jit", spy)
-    monkeypatch.setattr(descents, "Compiled", Spied)
-    weak = make_task("pusher", horizon=3).replace(theta=jnp.full(3, 0.1))  # a type that JAX calls weak
-    chosen: dict[str, Any] = {"contact": ("penalty",), "stiffness": (100.0,)} | SHORT | {"horizon": None}
-    run_study(StudyConfig(tasks=(weak,), estimators=("zobg",), **chosen))
-    steps = {program.__wrapped__: program._cache_size() for program in compiled}
-    steps = {getattr(function, "__name__", None): size for function, size in steps.items()}
-    assert steps["<lambda>"] == programs["descent"].num_compilations == 1  # an iteration's keys, and the iteration
-
-
-@pytest.mark.slow
 def test_outcomes_of_tennis_are_what_happened() -> None:
     """A ball was hit where the reference counts an impact; in MJX the paddle's corners count too."""
     task = make_task("tennis")

@@ -46,6 +46,10 @@ EVERY_TYPE = f"""
     <geom name="mesh" type="mesh" mesh="tetrahedron" pos="0 -.5 0"/>
   </body>
 </worldbody></mujoco>"""
+SPINNING = """<mujoco><worldbody><body pos="0 0 .1"><joint name="spin" axis="0 0 1"/>
+<geom type="box" size=".2 .1 .1"/></body></worldbody></mujoco>"""
+SLIDING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .02"><freejoint name="puck"/>
+<geom type="cylinder" size=".05 .02" friction=".01"/></body></worldbody></mujoco>"""
 
 
 def still(source: str) -> Motion:
@@ -184,28 +188,24 @@ def test_terrain_is_a_profile_where_the_bodies_are() -> None:
         (throw(gravity="0 0 0", x=1.0, y=1.0), "xy"),
         (throw(x=1.5, y=1.0, z=1.0), "xz"),
         (throw(gravity="0 -9.81 0", x=1.0, y=1.0), "xy"),
+        (moved(SPINNING, spin=3.0), "xy"),
+        (moved(SLIDING, puck=[1, 1, 0, 0, 0, 0]), "xy"),
     ],
-    ids=["thrown along x", "thrown along y", "falls", "slides x", "slides y", "planar", "oblique", "y is up"],
+    ids=[
+        "thrown along x",
+        "thrown along y",
+        "falls",
+        "slides x",
+        "slides y",
+        "planar",
+        "oblique",
+        "y is up",
+        "spinning box",
+        "sliding puck",
+    ],  # which stay at a height
 )
 def test_the_view_in_which_most_happens(motion: Motion, view: str) -> None:
     assert choose_view(motion).name == view
-
-
-@pytest.mark.parametrize(
-    ("body", "speeds"),
-    [
-        ('<body pos="0 0 .1"><joint name="spin" axis="0 0 1"/><geom type="box" size=".2 .1 .1"/>', {"spin": 3.0}),
-        (
-            '<geom type="plane" size="1 1 .1"/><body pos="0 0 .02"><freejoint name="puck"/>'
-            '<geom type="cylinder" size=".05 .02" friction=".01"/>',
-            {"puck": [1, 1, 0, 0, 0, 0]},
-        ),
-    ],
-    ids=["spinning box", "sliding puck"],
-)
-def test_bodies_that_stay_at_a_height_are_viewed_from_above(body: str, speeds: dict[str, Any]) -> None:
-    motion = moved(f"<mujoco><worldbody>{body}</body></worldbody></mujoco>", **speeds)
-    assert choose_view(motion).name == "xy"
 
 
 def test_a_floor_is_drawn_at_its_height_with_solid_below() -> None:
@@ -494,15 +494,6 @@ def test_a_library_that_fails_badly_does_no_harm(
     with pytest.raises(RenderError, match=reason):
         resolve_renderer("opengl")
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_model_that_opengl_cannot_render(monkeypatch: pytest.MonkeyPatch) -> None:
-    """auto draws it then; opengl says so."""
-    monkeypatch.setattr(opengl, "_backend", lambda chosen: ("egl", ""))
-    monkeypatch.setattr(opengl, "_run", lambda *_, **__: "out of memory")
-    assert strip(throw(), frames=2, renderer="auto").axes[0].get_xlabel() == "x [m]"
-    with pytest.raises(RenderError, match=r"MuJoCo's renderer failed \(out of memory\); use the renderer drawing"):
-        strip(throw(), renderer="opengl")
 
 
 def test_opengl_pictures(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

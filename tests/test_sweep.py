@@ -29,7 +29,7 @@ from mjx_study.objective import Simulator, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import warnings_of
 from mjx_study.simulation.contact import stiffness_from_solref
-from mjx_study.storage.folder import Store, load_study, open_store
+from mjx_study.storage.folder import load_study, open_store
 from mjx_study.tasks import make_task
 from tests.documents import same
 
@@ -145,55 +145,6 @@ ARGUMENTS = ["pusher", "--contact", "penalty,mujoco", "--stiffness", "10,1000", 
 def process(folder: Path, *more: str, **kwargs: Any) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "mjx_study", "sweep", *ARGUMENTS, "--output", str(folder), *more]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs)
-
-
-ZYGOTE = """
-import json, os, random, signal, sys, time
-from pathlib import Path
-import mujoco
-import numpy as np
-from mjx_study.storage.folder import Store
-from tests.documents import cell_arrays, study_document
-
-folder, cells = Path(sys.argv[1]), 40
-document = study_document(cells)
-
-def work():
-    store = Store.create(folder, document)
-    for index in store.missing:
-        with store.claims() as claim:
-            if claim(index) and not store.has(index):
-                time.sleep(0.002)
-                values = np.random.default_rng(index).normal(size=100_000)
-                store.write(index, cell_arrays(document, values=values))
-
-rng, kills = random.Random(0), 0
-while kills < 20:
-    child = os.fork()
-    if child == 0:
-        work()
-        os._exit(0)
-    time.sleep(rng.random() * 0.06)
-    os.kill(child, signal.SIGKILL)
-    kills += os.waitpid(child, 0)[1] == signal.SIGKILL
-    if not Store.open(folder).missing if (folder / "study.json").exists() else False:
-        break
-print(kills)
-work()
-"""
-
-
-def test_killed_at_any_moment_a_folder_is_whole(tmp_path: Path) -> None:
-    """Kills by SIGKILL at random moments of writing; each cell is then there with its own numbers, or not at all."""
-    command = [sys.executable, "-c", ZYGOTE, str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) >= 5
-    kept = Store.open(tmp_path / "out")
-    assert kept.missing == []
-    for index in range(40):
-        values = kept.read(index)["values"]
-        np.testing.assert_array_equal(values, np.random.default_rng(index).normal(size=100_000))
 
 
 @pytest.mark.slow

@@ -86,7 +86,7 @@ def test_of_gradients_seeds_cost_no_memory() -> None:
 
 
 PEAK = """
-import resource, sys
+import ast, resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
 from mjx_study.experiment import gradients, sampling
@@ -94,22 +94,35 @@ from mjx_study.experiment.plan import plan_study
 from tests.documents import numbers_of
 from tests.test_sweep_memory import Stub, config
 
-sampling.Simulator, gradients.GradientComputation._build = Stub, lambda *_: None
-plan = plan_study(config(samples=(10_000,), seeds=int(sys.argv[1]), horizon=200))
+options = ast.literal_eval(sys.argv[1])
+sampling.Simulator = Stub
+if "block_size" not in options:
+    gradients.GradientComputation._build = lambda *_: None
+plan = plan_study(config(**options))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 numbers_of(plan)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
 """
+GROWING: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
+    "seeds": ({"samples": (10_000,), "horizon": 200}, {"seeds": 2}, {"seeds": 8}),
+    "samples": (
+        {"block_size": 10_000, "seeds": 1, "horizon": 50}, {"samples": (40_000,)}, {"samples": (160_000,)},
+    ),
+}  # fmt: skip
+"""By what grows: the rest of the study, a small one and a large one."""
 
 
 @pytest.mark.slow
-def test_memory_does_not_grow_with_seeds() -> None:
-    """10,000 samples of 200 parameters: at most what the plan says, of two seeds as of eight."""
+@pytest.mark.parametrize("name", GROWING)
+def test_memory_does_not_grow(name: str) -> None:
+    """With seeds it is what the plan says; with samples in blocks, a fraction of what whole batches would take."""
+    common, *sizes = GROWING[name]
     peak = []
-    for seeds in ("2", "8"):
-        command = [sys.executable, "-c", PEAK, seeds]
+    for size in sizes:
+        command = [sys.executable, "-c", PEAK, repr(common | size)]
         done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
         assert done.returncode == 0, done.stderr
         peak.append(float(done.stdout))
-    foreseen = plan_study(config(samples=(10_000,), seeds=2, horizon=200)).memory / 1e9
-    assert peak[1] < 1.15 * peak[0] and foreseen / 2 < peak[1] < 2 * foreseen, (peak, foreseen)
+    planned = plan_study(config(**(common | sizes[name == "samples"] | {"block_size": None}))).memory / 1e9
+    assert peak[1] < 1.15 * peak[0] + 0.01, peak
+    assert planned / 2 < peak[1] < 2 * planned if name == "seeds" else peak[1] < planned / 4, (peak, planned)

@@ -34,6 +34,7 @@ class Engine:
         adapter: module in `adapters`, and variant.
         how: way of differentiation, as the engine's documentation has it.
         single: whether it computes in float32.
+        slow: whether a quarter of the rollouts must do.
     """
 
     label: str
@@ -42,6 +43,7 @@ class Engine:
     variant: str
     how: str
     single: bool = False
+    slow: bool = False
 
 
 ENVIRONMENTS: Final = {
@@ -54,6 +56,7 @@ ENVIRONMENTS: Final = {
     "newton_1_0": Environment(("newton==1.0.0", "warp-lang==1.12.0")),
     "newton": Environment(("newton==1.8.0", "warp-lang==1.19.0")),
     "jaxsim": Environment(("jaxsim==0.9.0", "jax==0.10.2", "jaxlib==0.10.2")),
+    "nimble": Environment(("nimblephysics==0.10.52.1", "torch==2.14.1", "numpy<2"), ("3.10",)),
     "drake": Environment(("drake==1.58.0",), ("3.12",)),
 }
 ENGINES: Final = {
@@ -83,6 +86,7 @@ ENGINES: Final = {
         f"drake_{name}": Engine(f"Drake 1.58.0, {name}", "drake", "drake_plant", name, "AutoDiffXd")
         for name in ("sap",)
     },
+    "nimble": Engine("Nimble 0.10.52", "nimble", "nimble_physics", "lcp", "torch's tape", slow=True),
     "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode"),
 }
 

@@ -61,4 +61,5 @@ def run(options: argparse.Namespace) -> int:
         return plan_study(StudyConfig(**study_fields(options)))
 
     lines = partial(gradient_lines, details=options.details)
-    return run_one(options, planned, rows_as_json, lines, "figures and the numbers on disk")
+    offer = "figures and the numbers on disk"
+    return run_one(options, planned, rows_as_json, lines, offer, thetas=lambda document: {})

@@ -66,7 +66,12 @@ def run(options: argparse.Namespace) -> int:
         return plan_study(StudyConfig(**fields, kind="descents"), single=True)
 
     offer = "a figure, the policies, and a run that can be resumed"
-    return run_one(options, planned, descents, descent_lines, offer, _save_policies)
+    return run_one(options, planned, descents, descent_lines, offer, _save_policies, _best_policies)
+
+
+def _best_policies(document: dict[str, Any]) -> dict[str, Any]:
+    """Parameters at the end of each estimator's best descent."""
+    return {run["estimator"]: run["theta"][run["best_seed"]] for run in document["runs"]}
 
 
 def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:

@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import xarray as xr
 
 from mjx_study.cli.options import configure_process, usage_errors
 from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
+from mjx_study.diagnose.means import MeanCheck, check_terms, term_lines
 from mjx_study.execution.cluster import connected
 from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.lost import all_lost
@@ -42,6 +43,7 @@ def run_one(
     lines_of: Callable[[xr.Dataset, dict[str, Any]], list[str]],
     offer: str,
     also: Callable[[dict[str, Any], Path], list[Path]] = lambda document, folder: [],
+    thetas: Callable[[dict[str, Any]], Mapping[str, Any]] | None = None,
 ) -> int:
     """Run a command about one study: plan, compute, draw if an output folder is given, print.
 
@@ -51,6 +53,7 @@ def run_one(
         lines_of: formats the study and its document as text.
         offer: what `--output` would add.
         also: writes further files of the document into the folder, and returns their paths.
+        thetas: parameters at which to check means with an onset term, see `check_terms`; None not to check.
     """
     with usage_errors():
         configure_process(options)
@@ -64,13 +67,21 @@ def run_one(
         for write in (lambda: also(document, folder), lambda: save_figures(plot_study(dataset), folder)):
             paths, failure = attempt(write)
             written, failures = written + paths, [*failures, failure]
-    lines = [*lines_of(dataset, document), *(f"warning: {message}" for message in document["warnings"])]
+    checks = _checked(plan, thetas(document)) if thetas else []
+    document |= {"means": [each.as_dict() for each in checks]} if checks else {}
+    about = term_lines(checks, plan.config.onset)
+    lines = [*lines_of(dataset, document), *about, *(f"warning: {message}" for message in document["warnings"])]
     lines += [f"add --output DIR for {offer}"] if folder is None else []
     if folder is not None and not dataset.attrs["computed_cells"] and not dataset.attrs["missing_cells"]:
         lines.append(f"nothing was computed: {folder} already holds all {len(plan.cells)} cells")
     if folder is not None and not unwritten:
         lines.append(f"written to {folder}: {', '.join([*(path.name for path in written), KEPT])}")
     return print_report(options, document, lines, *failures, all_lost(plan, dataset))
+
+
+def _checked(plan: StudyPlan, thetas: Mapping[str, Any]) -> list[MeanCheck]:
+    with computing() as progress:
+        return check_terms(plan, thetas, progress)
 
 
 def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:

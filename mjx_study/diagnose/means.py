@@ -6,8 +6,9 @@ steps reveals.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import itemgetter
+from types import MappingProxyType
 from typing import Any, Final
 
 import jax
@@ -21,11 +22,13 @@ from estimators.registry import label_of
 from mjx_study.diagnose.columns import MEANS
 from mjx_study.experiment.resolution import check_estimators, direction_of
 from mjx_study.experiment.sampling import cell_keys, draw_batches
+from mjx_study.experiment.study import StudyPlan, estimators_of
+from mjx_study.experiment.unused_options import CORRECTED, reads_onset
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.options.configuration import check_span
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import local_devices
-from mjx_study.table import Column, as_plain, tabulate
+from mjx_study.table import Column, as_plain, percent, tabulate
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
@@ -136,6 +139,7 @@ def check_mean(
     span: Sequence[float] | None = None,
     direction: str = "random",
     tolerance: float = TOLERANCE,
+    chunk_size: int | None = None,
     progress: Progress = silent,
 ) -> list[MeanCheck]:
     """Check every estimator for every contact model.
@@ -151,6 +155,7 @@ def check_mean(
             noise to either side, or 0.02 for noise on the controls.
         direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
         tolerance: share of the cost's difference within which a mean is right.
+        chunk_size: samples per program call, such as that of programs built before; by default chosen.
         progress: called with (contact models done, their total number, label of the next).
 
     Raises:
@@ -161,7 +166,7 @@ def check_mean(
     low, high = span or (-reach_of(task), reach_of(task))
     axis = "random" if direction == ALONG_MEANS else direction
     along = jnp.asarray(direction_of(axis, task.policy.num_params, seed), task.theta.dtype)
-    simulator = Simulator(task, chunk_size=chunk_for(samples, local_devices(), [task]))
+    simulator = Simulator(task, chunk_size=chunk_size or chunk_for(samples, local_devices(), [task]))
     found, ends = [], (task.theta + low * along, task.theta + high * along)
     for index, cell in enumerate(cells):
         progress(index, len(cells), cell.label)
@@ -181,6 +186,49 @@ def check_mean(
         ]
     progress(len(cells), len(cells), "done")
     return found
+
+
+def check_terms(
+    plan: StudyPlan, thetas: Mapping[str, Sequence[float]] = MappingProxyType({}), progress: Progress = silent
+) -> list[MeanCheck]:
+    """Check the means of a study's estimators that have an onset term, along themselves, with the study's samples.
+
+    Of up to three paths, the result has the one with the largest gap. It needs no reference gradient.
+
+    Args:
+        thetas: parameters at which to check, by estimator; by default the task's.
+        progress: as for `check_mean`.
+    """
+    found = []
+    for cell in [each for each in plan.cells if not each.model.analytic]:
+        chosen = zip(plan.config.estimator_names, estimators_of(plan, cell), strict=True)
+        for name, estimator in chosen:
+            task = plan.task_of(cell).replace(sigma=cell.sigma)
+            at = task.replace(theta=jnp.asarray(thetas.get(name, task.theta), task.theta.dtype))
+            corrected = CORRECTED in estimator.needs or (task.onset != "none" and reads_onset([estimator]))
+            if not (corrected and np.all(np.isfinite(at.theta))):
+                continue
+            common = {"samples": cell.samples, "seed": plan.config.seed, "chunk_size": plan.chunk_size}
+            paths = check_mean(
+                at, [cell.model], [estimator], names=[name], direction=ALONG_MEANS, progress=progress, **common
+            )
+            found.append(max(paths, key=lambda each: abs(float(each.circulation.gap))))
+    return found
+
+
+def term_lines(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
+    """Say of every check what it found."""
+    lines = []
+    for check in checks:
+        row, name = check.as_dict(), label_of(check.estimator, onset)
+        where = f"{check.contact}, K = {check.stiffness:g} N/m" if check.stiffness else check.contact
+        more = "; more --samples decide it" if check.verdict == "undecided" else ""
+        gap, half = row["relative_gap"], (row["detectable"] or 0.0) / 2
+        found = "the mean cost is flat" if gap is None else f"{percent(abs(gap), 2)} ± {percent(half, 2)} off"
+        lines.append(
+            f"{where}: the mean of {name} is {check.verdict}: {found} along its path, without a reference{more}."
+        )
+    return lines
 
 
 def lines_of(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:

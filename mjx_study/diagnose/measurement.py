@@ -52,7 +52,8 @@ class Measured:
         seconds: computing time per sample [s].
         paths: checks of the mean along paths; none for zeroth order, which is unbiased.
         verdict: verdict on the mean: unbiased by theory, or right, biased or undecided by the check.
-        bias: deviation of the mean along the paths, beyond one standard error [gradient].
+        bias: deviation of the mean along the paths, less its standard error, or if undecided with it (both in squares)
+            [gradient].
         norm: norm of the mean, without what noise adds to it [gradient].
         lost: number of excluded nonfinite samples.
     """
@@ -214,7 +215,9 @@ def _measured(
     lower, upper = variance_interval(estimate, 0.95)
     squared = float(jnp.sum(estimate.mean**2)) - float(estimate.variance) / samples
     verdicts = {each.verdict() for each in paths}
-    missed = sum(max(0.0, float(each.gap**2 - each.standard_error**2)) for each in paths)
+    verdict = next((each for each in ("biased", "undecided", "right") if each in verdicts), "unbiased")
+    sign = 1 if verdict == "undecided" else -1
+    missed = sum(max(0.0, float(each.gap**2 + sign * each.standard_error**2)) for each in paths)
     return Measured(
         estimator=estimator.name,
         variance=float(estimate.variance),
@@ -222,7 +225,7 @@ def _measured(
         upper=float(upper),
         seconds=seconds / samples,
         paths=paths,
-        verdict=next((each for each in ("biased", "undecided", "right") if each in verdicts), "unbiased"),
+        verdict=verdict,
         bias=math.sqrt(missed) / (2 * reach),
         norm=math.sqrt(max(squared, 0.0)),
         lost=int(estimate.num_nonfinite),

@@ -193,7 +193,7 @@ def _parameter_kinks(context: FindingContext, source: Coordinate) -> Iterator[st
         if np.any(np.abs(solimp[:, [entry]] - bounds) < NEAR_DISTANCE):
             yield f"{source.name} is at the bound where MuJoCo clips it"
         if entry < 2 and np.any(np.abs(solimp[:, 0] - solimp[:, 1]) < NEAR_DISTANCE):
-            yield "d_0 equals d_width, and MuJoCo clips the impedance between the two"
+            yield "d_0 equals d_width, and MJX clips the impedance between the two"
     if source.name == "solimp[power]" and np.any(solimp[:, 4] == 1):
         yield "solimp's power is 1, the smallest that MuJoCo accepts"
     if source.name == "solref[1]" and np.any((solref[:, 0] <= 0) & (np.abs(solref[:, 1]) < NEAR_DISTANCE)):

@@ -152,4 +152,7 @@ INDEXING: Final = {
     "gather": _gather,
     "scatter": _scatter(None),
     "scatter-add": _scatter(lax.add_p),
+    "scatter-max": _scatter(lax.max_p),
+    "scatter-min": _scatter(lax.min_p),
+    "scatter-mul": _scatter(lax.mul_p),
 }

@@ -164,19 +164,21 @@ def _solved(solver: constraint.Solver, scene: Scene, model: mjx.Model, state: St
 
 
 def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
-    """Evaluate `function(model, *arguments)`, unrolled if that pays: few degrees of freedom and a constant model."""
-    if model.nv <= MOST_UNROLLED and not isinstance(model.body_mass, Tracer):
-        return unrolled(function, model, *arguments)
-    return function(model, *arguments)
+    """Evaluate `function(model, *arguments)`, unrolled if that pays: a constant model, and few degrees of freedom or
+    native code."""
+    small = model.nv <= MOST_UNROLLED or native_identity() is not None
+    constant = not isinstance(model.body_mass, Tracer)
+    return unrolled(function, model, *arguments) if small and constant else function(model, *arguments)
 
 
 def with_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
     """Evaluate `function(solver, model, *arguments)`, of any size if native code pays for it, else `entry_by_entry`."""
     plain, solved = (partial(function, solver) for solver in (constraint.run_solver, constraint.newton))
-    larger = model.nv > MOST_UNROLLED and constraint.OWN_SOLVER and native_identity() is not None
-    if larger and not isinstance(model.body_mass, Tracer):
+    if model.nv <= MOST_UNROLLED:
+        return entry_by_entry(plain, model, *arguments)
+    if constraint.OWN_SOLVER and native_identity() is not None and not isinstance(model.body_mass, Tracer):
         return unrolled(solved, model, *arguments, otherwise=plain)
-    return entry_by_entry(plain, model, *arguments)
+    return plain(model, *arguments)
 
 
 ControlLaw = Callable[[Any, State], Control]
@@ -288,6 +290,14 @@ def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """MJX's `fwd_position`, patched."""
     with patched():
         return mjx.fwd_position(model, data)
+
+
+@jax.jit
+def motion(model: mjx.Model, data: mjx.Data, qpos: Qpos, qvel: Qvel) -> mjx.Data:
+    """Positions and velocities of bodies."""
+    with patched():
+        data = mjx.com_pos(model, mjx.kinematics(model, data.replace(qpos=qpos, qvel=qvel)))
+        return mjx.com_vel(model, data)
 
 
 @jax.jit

@@ -23,7 +23,7 @@ from estimators.choices import suggestion
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
-from mjx_study.simulation.dynamics import Act, Control, Qpos, State, acceleration, entry_by_entry, smooth_stages
+from mjx_study.simulation.dynamics import Act, Control, Qpos, State, acceleration, entry_by_entry, motion, smooth_stages
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
 
@@ -162,14 +162,9 @@ def observed(
 
 def _motion(scene: Scene, name: str, model: mjx.Model, qpos: Qpos, qvel: Array | None = None) -> Float[Array, "..."]:
     """A quantity of positions, or with qvel of velocities."""
-    with patched():
-        data = mjx.kinematics(model, scene.template.replace(qpos=qpos))
-        if name in POSITIONS and name != "subtree_com":
-            return getattr(data, name)
-        data = mjx.com_pos(model, data)
-        if name == "subtree_com":
-            return data.subtree_com
-        data = mjx.com_vel(model, data.replace(qvel=qvel))
+    data = motion(model, scene.template, qpos, scene.template.qvel if qvel is None else qvel)
+    if name in POSITIONS:
+        return getattr(data, name)
     if name == "cvel":
         return data.cvel
     return _velocity(scene.host, data, name)

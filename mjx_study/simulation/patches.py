@@ -53,8 +53,8 @@ def stiffness_damping_impedance(
     rise = jnp.where(below, depth, midpoint) ** power / midpoint ** (power - 1)
     fall = jnp.where(within & ~below, 1 - depth, 1 - midpoint) ** power / (1 - midpoint) ** (power - 1)
     share = jnp.where(below, rise, 1 - fall)
-    # MuJoCo clips to [d_0, d_width], which has no effect between the two
-    impedance = jnp.where(within & (low < high), low + share * (high - low), high)
+    # MJX clips to [d_0, d_width], which has no effect between the two; the C engine interpolates between any two
+    impedance = jnp.where(within, low + share * (high - low), high)
     return k, b, impedance
 
 

@@ -243,7 +243,6 @@ def test_plans_are_refused() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["pusher", "--pair", "a,b"], "--pair is for files"),
         (["FILE", "--pair", "a"], "names of two geoms, got 1"),
         (["FILE", "--model", "FILE"], "a file already"),
         (["FILE", "--contact", "penalty"], "--stiffness must be given in N/m, along with --pair"),
