@@ -34,7 +34,6 @@ class Engine:
         adapter: module in `adapters`, and variant.
         how: way of differentiation, as the engine's documentation has it.
         single: whether it computes in float32.
-        slow: whether a quarter of the rollouts must do.
     """
 
     label: str
@@ -43,7 +42,6 @@ class Engine:
     variant: str
     how: str
     single: bool = False
-    slow: bool = False
 
 
 ENVIRONMENTS: Final = {
@@ -86,7 +84,7 @@ ENGINES: Final = {
         f"drake_{name}": Engine(f"Drake 1.58.0, {name}", "drake", "drake_plant", name, "AutoDiffXd")
         for name in ("sap",)
     },
-    "nimble": Engine("Nimble 0.10.52", "nimble", "nimble_physics", "lcp", "torch's tape", slow=True),
+    "nimble": Engine("Nimble 0.10.52", "nimble", "nimble_physics", "lcp", "torch's tape"),
     "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode"),
 }
 

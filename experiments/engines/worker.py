@@ -21,7 +21,7 @@ def main() -> None:
     name, scene, timestep = sys.argv[1:4]
     engine = ENGINES[name]
     build = import_module(f"experiments.engines.adapters.{engine.adapter}").build
-    counts = FEW if sys.argv[4:] or engine.slow else MANY
+    counts = FEW if sys.argv[4:] else MANY
     try:
         simulate = build(SCENES[scene], float(timestep), engine.variant)
         found = measure(simulate, SCENES[scene], counts, single=engine.single)
