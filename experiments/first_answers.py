@@ -2,9 +2,10 @@
 
     python -m experiments.first_answers [--page docs/performance.md] [--only SESSION]
 
-A session is a list of commands on a task of one's own, an arm that swats a box. Each command runs in a process of its
-own; the caches are empty when a session begins. The processor time of tracing is that of the threads in which JAX
-announces it, that of native code the C compiler's; XLA compiles in threads of its own, and so counts among the rest.
+A session is a list of commands on a task of one's own, an arm that swats a box, or on a quadruped's file. Each runs in
+a process of its own; the caches are empty when a session begins. The processor time of tracing is that of the threads
+in which JAX announces it, that of native code the C compiler's; XLA compiles in threads of its own, and so counts among
+the rest.
 """
 
 import argparse
@@ -56,7 +57,9 @@ SESSIONS: Final = {
         "optimise swat:swat --iterations 20 --learning-rate 0.1 --samples 20",
     ),
     "diagnosis": ("diagnose swat:swat", "diagnose swat:swat"),
+    "quadruped": ("diagnose quadruped.xml", "diagnose quadruped.xml"),
 }
+MODELS: Final = DATA.parents[1] / "models"
 HEADER: Final = (
     "command",
     "wall [s]",
@@ -153,6 +156,7 @@ def main() -> None:
             folder = Path(place)
             (folder / "swat.py").write_text(TASK)
             shutil.copy(DATA / "arm.xml", folder)
+            shutil.copy(MODELS / "quadruped.xml", folder)
             for command in SESSIONS[session]:
                 rows.append(row_of(command, in_a_process(command, folder)))
                 print(" ".join(rows[-1]), flush=True)

@@ -251,12 +251,13 @@ def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices
         last, values = jax.lax.scan(advance, first, policy.feedforward(theta, noise))
         return jnp.sum(values) + final_cost(State(last.qpos, last.qvel, last.act, last.qacc_warmstart))
 
-    def program(function):
-        return Compiled(jax.vmap(function, in_axes=(None, None, 0)))
+    def stock_rollouts(theta, contact, key):
+        return cost(theta, contact, key, int(scene.host.opt.iterations))
 
-    budget = int(scene.host.opt.iterations)
-    values = program(lambda theta, contact, key: cost(theta, contact, key, budget))
-    gradients = program(jax.grad(lambda theta, contact, key: cost(theta, contact, key, 1)))
+    def stock_gradients(theta, contact, key):
+        return jax.grad(cost)(theta, contact, key, 1)
+
+    values, gradients = (Compiled(jax.vmap(each, (None, None, 0))) for each in (stock_rollouts, stock_gradients))
     shared, rows = (task.theta, contact), (np.asarray(jax.random.key_data(keys)),)
     chunk = -(-len(keys) // len(devices))
     return tuple((lambda run=run: spread(run, shared, rows, chunk, devices)) for run in (values, gradients))

@@ -247,7 +247,7 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     lines = [
         f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
         f"{config['iterations']} iterations",
-        f"{config['samples']} samples in each batch, {config['seeds']} seeds from {config['seed']}, "
+        f"{config['samples']} samples in each batch, {_seeds(config)}, "
         f"sigma {config['sigma']:g}; {start.heading} {with_error(mean, error, start.digits)}{metrics}",
         "",
         *format_table([_row(run, onset) for run in document["runs"]], headings),
@@ -257,6 +257,10 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
             label = label_of(run["estimator"], onset)
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
     return lines + [f"{sentence}." for sentence in document["findings"]]
+
+
+def _seeds(config: dict[str, Any]) -> str:
+    return f"seed {config['seed']}" if config["seeds"] == 1 else f"{config['seeds']} seeds from {config['seed']}"
 
 
 def _row(run: dict[str, Any], onset: str) -> list[str]:

@@ -380,11 +380,12 @@ class _Run:
         """Report the progress of all estimators, and their costs so far."""
         backend = self.backend
         with backend.saving:
-            costs = np.asarray(self.records[-1].cost)
-            costs = costs[np.isfinite(costs)]
-            backend.costs[self.estimator.name] = done, float(np.mean(costs)) if len(costs) else math.nan
+            last = np.asarray(self.records[-1].cost)
+            last = last[np.isfinite(last)]
+            backend.costs[self.estimator.name] = done, float(np.mean(last)) if len(last) else math.nan
             total = len(backend.costs) * backend.recipe.iterations
-            shown = ", ".join(f"{name} {number(cost, 4)}" for name, (_, cost) in backend.costs.items())
+            costs = {name: cost for name, (_, cost) in backend.costs.items() if not math.isnan(cost)}
+            shown = ", ".join(f"{name} {number(cost, 4)}" for name, cost in costs.items())
             self.checkpoint.report(sum(each for each, _ in backend.costs.values()), total, f"descent; cost: {shown}")
 
     def _collect(self, pending: list[Record], since: float) -> float:

@@ -67,8 +67,10 @@ class Simulator:
 
     def memory(self, kind: str, contact: ContactModel | None, samples: int) -> int:
         """XLA's planned temporary memory [bytes] for a batch of one kind, all chunks at once on all devices."""
-        arguments = self._chunk(self.task.theta, contact, 1.0)
-        plan: Any = self._programs[kind].jitted.lower(*arguments).compile().memory_analysis()
+        arguments = self._chunk(self.task.theta, contact_for(kind, contact), 1.0)
+        ready: Any = self._programs[kind].executable(*arguments)
+        built = ready if isinstance(ready, jax.stages.Compiled) else ready.lower(*arguments).compile()
+        plan: Any = built.memory_analysis()
         return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def run(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, keys: Any, noise_scale: Any) -> Any:
