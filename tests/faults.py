@@ -16,6 +16,9 @@ from typing import Any, Final
 
 import pytest
 
+from mjx_study.disk import write_whole
+from mjx_study.storage import cell_files
+
 CALLS: Final = ("open", "mkdir", "fsync", "fchmod", "replace")
 """Functions of `os` that change the disk; writes to open files count as well."""
 FUTURE: Final = 4_000_000_000
@@ -64,6 +67,25 @@ class Faults:
             return io.BufferedWriter(Counted(descriptor, mode))
 
         return called
+
+
+class Killed(BaseException):
+    """Ends a study as a kill would."""
+
+
+def kill_after(patch: pytest.MonkeyPatch, last: Callable[[Path, int], bool], *others: Any) -> list[Path]:
+    """Kill after a write of cells, or of other modules, for which `last` of path and number is true; those written."""
+    written: list[Path] = []
+
+    def killed(path: Path, write: Any) -> Path:
+        written.append(write_whole(path, write))
+        if last(path, len(written)):
+            raise Killed
+        return path
+
+    for module in (cell_files, *others):
+        patch.setattr(module, "write_whole", killed)
+    return written
 
 
 def every_fault(code: int, work: Callable[[], Any], *, lasting: bool = False) -> Generator[int]:

@@ -61,10 +61,7 @@ def test_the_batches_agree(drawn) -> None:
     close(pull_back(by_step.noise_gradient, by_step.policy_jacobian), differentiation.gradient)
     close(truncated_first_order(linearisation, task.horizon).per_sample, differentiation.gradient)
     assert steps.noise_score.shape == (SAMPLES, *task.policy.noise_shape)
-    for plus, minus, whole in (
-        (*batches["pair"], evaluation),
-        (*batches["step_pair"], steps),
-    ):
+    for plus, minus, whole in ((*batches["pair"], evaluation), (*batches["step_pair"], steps)):
         for field in dataclasses.fields(whole):
             one, other = getattr(plus, field.name), getattr(whole, field.name)
             assert (one is None) == (other is None)

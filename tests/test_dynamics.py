@@ -185,8 +185,7 @@ def test_reverse_mode_is_the_central_difference(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name == "sphere-sphere condim 1" else [pytest.mark.slow]) for name in CASES],
+    "name", [pytest.param(name, marks=[] if name == "sphere-sphere condim 1" else [pytest.mark.slow]) for name in CASES]
 )
 def test_both_programs_and_both_modes_agree(name: str) -> None:
     """The tape, forwards and backwards, and the graph's matrix equal the graph in reverse mode."""

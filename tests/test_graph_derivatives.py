@@ -17,6 +17,7 @@ from mjx_study.graph.native import native_summary
 from mjx_study.graph.nodes import ELEMENTWISE, entries_of
 from mjx_study.graph.operation import applied, computed
 from mjx_study.simulation.linear_algebra import solve_positive_definite
+from tests.test_second_derivatives import COMPOSITIONS
 
 Function = Callable[..., Any]
 ROW = np.array([0.3, -1.2, 2.5])
@@ -203,13 +204,7 @@ def test_jax_differentiates_what_the_graph_does_not(name: str) -> None:
         all_close(ours, mode(lambda x: REFUSED[name](x) ** 2)(ROW))
 
 
-COMPOSED: dict[str, Callable[[Function], Function]] = {
-    "once": jax.jacrev,
-    "forward over reverse": lambda f: jax.jacfwd(jax.jacrev(f)),
-    "reverse over reverse": lambda f: jax.jacrev(jax.jacrev(f)),
-    "reverse over forward": lambda f: jax.jacrev(jax.jacfwd(f)),
-    "forward over forward": lambda f: jax.jacfwd(jax.jacfwd(f)),
-}
+COMPOSED: dict[str, Callable[[Function], Function]] = {"once": jax.jacrev, **COMPOSITIONS}
 
 
 @pytest.mark.parametrize("name", COMPOSED)

@@ -17,7 +17,6 @@ import xarray as xr
 
 from mjx_study import identity
 from mjx_study.digest import digest_of
-from mjx_study.disk import write_whole
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import plan_study
@@ -26,12 +25,12 @@ from mjx_study.identity import contents, differences, git_revision
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import warnings_of
 from mjx_study.simulation.scene import models_folder
-from mjx_study.storage import cell_files as cell_file
-from mjx_study.storage import folder as store
+from mjx_study.storage import folder
 from mjx_study.storage.folder import Store, load_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
 from tests.documents import altered, content, planned_arrays, stub_cells
+from tests.faults import Killed, kill_after
 
 MODULE = """
 from functools import partial
@@ -284,23 +283,9 @@ def test_a_checkpoint_of_other_arrays_is_refused(tmp_path: Path, changes: dict[s
 def test_a_run_made_longer_survives_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
     """Killed at each write of the step from six iterations to eight, it is done again, to the same numbers."""
     descended(tmp_path, 6)
-    count = [0]
-
-    class Killed(BaseException):
-        pass
-
-    def killed(path: Path, write: Any) -> Path:
-        count[0] += 1
-        written = write_whole(path, write)
-        if count[0] == moment:
-            raise Killed
-        return written
-
-    with monkeypatch.context() as patch:
-        for module in (store, cell_file):
-            patch.setattr(module, "write_whole", killed)
-        with pytest.raises(Killed):
-            descended(tmp_path, 8)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_after(patch, lambda path, count: count == moment, folder)
+        descended(tmp_path, 8)
     assert descended(tmp_path, 8).drop_vars("seconds").equals(descended(None, 8).drop_vars("seconds"))
 
 

@@ -28,6 +28,7 @@ from mjx_study.storage import cell_files, folder
 from mjx_study.storage.arrays import required
 from mjx_study.storage.folder import Store, load_study
 from tests.documents import content, same, study_document
+from tests.faults import Killed, kill_after
 from tests.test_layering import FILES, ROOT
 
 NUMBERS = Path(__file__).parent / "data" / "kinds.json"
@@ -105,32 +106,19 @@ def test_a_cell_depends_on_no_other(studies: dict[str, Path], name: str) -> None
                 np.testing.assert_array_equal(stored[key], arrays[key], err_msg=key)
 
 
-class Killed(BaseException):
-    pass
-
-
 @each_kind
 @pytest.mark.parametrize("moment", [1, 3])
 def test_a_killed_run_resumes_to_the_same_numbers(
     studies: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, moment: int
 ) -> None:
     """Killed after one of its first writes of a cell or a checkpoint."""
-    writes, whole = [0], cell_files.write_whole
-
-    def killed(path: Path, write: Any) -> Path:
-        written = whole(path, write)
-        writes[0] += 1
-        if writes[0] == moment:
-            raise Killed
-        return written
-
     with monkeypatch.context() as patch:
-        patch.setattr(cell_files, "write_whole", killed)
+        written = kill_after(patch, lambda path, count: count == moment)
         patch.setattr(descents, "SAVE_SECONDS", 0.0)
         try:
             run_study(config(name), tmp_path)
         except Killed:
-            assert load_study(tmp_path).attrs["missing_cells"] or writes[0] == len(list(tmp_path.glob("cells/*")))
+            assert load_study(tmp_path).attrs["missing_cells"] or len(written) == len(list(tmp_path.glob("cells/*")))
     assert same(run_study(config(name), tmp_path), load_study(studies[name]))
     assert not list(tmp_path.glob("cells/*.part.npz"))
 

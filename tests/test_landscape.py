@@ -299,10 +299,7 @@ def test_theta_has_its_unit(drawn: tuple[Path, str], tmp_path: Path) -> None:
     written = tmp_path / "before" / "study.json"
     resolved = json.loads(written.read_text())["resolved"]
     altered(written, resolved=[{name: each[name] for name in each if name != "unit"} for each in resolved])
-    for folder, unit, label in (
-        (drawn[0], "rad", "theta [rad]"),
-        (tmp_path / "before", "unit of theta", "theta"),
-    ):
+    for folder, unit, label in ((drawn[0], "rad", "theta [rad]"), (tmp_path / "before", "unit of theta", "theta")):
         data = load_study(folder)
         assert data["position"].attrs["units"] == unit
         (figure,) = plot_study(data).values()

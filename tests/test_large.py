@@ -110,9 +110,7 @@ def in_order(computed: Computed, order: Any, *, kept: bool = False) -> Blocks:
     return blocks
 
 
-def test_not_a_bit_depends_on_the_order_or_on_checkpoints(
-    cell: Computed,
-) -> None:
+def test_not_a_bit_depends_on_the_order_or_on_checkpoints(cell: Computed) -> None:
     expected = in_order(cell, range(12))
     numbers = expected.numbers()
     rng = np.random.default_rng(0)
@@ -126,9 +124,7 @@ def test_not_a_bit_depends_on_the_order_or_on_checkpoints(
         np.testing.assert_array_equal(array, numbers[name], err_msg=name)
 
 
-def test_no_more_is_kept_than_the_logarithm_of_the_blocks(
-    cell: Computed,
-) -> None:
+def test_no_more_is_kept_than_the_logarithm_of_the_blocks(cell: Computed) -> None:
     for late in range(1, 12):
         order = [unit for unit in range(12) if unit != late]
         blocks = in_order(cell, order)

@@ -30,6 +30,7 @@ SMALL = {
         "STATES, STEPS, FORCES, POINTS = 1, 5, 3, 3\nCONTACT, HORIZON = ('mujoco_default', 'smooth_onset'), 190"
     ),
     "5_identify_contact": "TOSSES, STEPS = 2, 60",
+    "6_teach_a_robot": "STEPS, SAMPLES, UPDATES = 80, 2, 2",
 }
 """Parameters of a short run."""
 ABSOLUTE = re.compile(r"(?<![\w.~])/(?:home|root|Users|tmp|var|usr|opt|mnt|srv|private|proc)/|[A-Z]:\\\\")

@@ -23,16 +23,7 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
 from tests.carts import cart
 from tests.estimators.statistics_helpers import assert_mean_is
-from tests.pusher_fixtures import (
-    HORIZON,
-    NO_NOISE,
-    SIGMA,
-    cost,
-    penalty,
-    pusher_simulator,
-    pusher_task,
-    sample_keys,
-)
+from tests.pusher_fixtures import HORIZON, NO_NOISE, SIGMA, cost, penalty, pusher_simulator, pusher_task, sample_keys
 
 ANY_CONTACT = ContactModel(jnp.array([-1.0, -1.0]), jnp.array([0.9, 0.9, 0.001, 0.5, 2.0]))
 LIMIT = 0.25  # [N]; controls beyond it have no cost in the task that breaks
@@ -113,10 +104,7 @@ def test_a_sample_depends_on_its_own_key_alone(simulator):
     objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
     order = np.random.default_rng(0).permutation(70)
     straight = objective.evaluate(theta, sample_keys(70)), objective.differentiate(theta, sample_keys(70))
-    mixed = (
-        objective.evaluate(theta, sample_keys(70)[order]),
-        objective.differentiate(theta, sample_keys(70)[order]),
-    )
+    mixed = (objective.evaluate(theta, sample_keys(70)[order]), objective.differentiate(theta, sample_keys(70)[order]))
     for one, other in zip(straight, mixed, strict=True):
         np.testing.assert_allclose(other.value, one.value[order], rtol=1e-12)
     np.testing.assert_array_equal(mixed[0].score, straight[0].score[order])

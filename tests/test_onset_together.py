@@ -93,8 +93,7 @@ MIXED = floor_scene(
     '<geom name="box" type="box" size=".2 .1 .1" mass="1"/></body>',
     option(4e-3, "", 'refsafe="disable"'),
 ).replace(
-    "</mujoco>",
-    '<tendon><fixed limited="true" range=".0001 1"><joint joint="x" coef="1"/></fixed></tendon></mujoco>',
+    "</mujoco>", '<tendon><fixed limited="true" range=".0001 1"><joint joint="x" coef="1"/></fixed></tendon></mujoco>'
 )
 
 

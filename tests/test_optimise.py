@@ -16,7 +16,7 @@ from PIL import Image
 
 import estimators
 from estimators import ESTIMATORS, Differentiation, FirstOrder
-from mjx_study import cli, disk
+from mjx_study import cli
 from mjx_study.cli import motions
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import descents, plan, sampling
@@ -32,11 +32,11 @@ from mjx_study.options.files import POLICY_OPTIONS
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
 from mjx_study.results.kind import findings_of
 from mjx_study.results.variables import HISTORY, METRIC
-from mjx_study.storage import cell_files as cell_file
 from mjx_study.storage import folder as store
 from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.task import StudyDefaults
+from tests.faults import Killed, kill_after
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
@@ -139,20 +139,10 @@ def test_a_run_killed_in_its_middle_goes_on(tmp_path: Path, monkeypatch: pytest.
     study = config(estimators=("zobg", "fobg"), contact=("reference",), iterations=15)
     whole = descend(study)
 
-    class Killed(BaseException):
-        pass
-
-    def killed(path: Path, write: Any) -> Path:
-        written = disk.write_whole(path, write)
-        if path.name == "00000.part.npz":
-            raise Killed
-        return written
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cell_file, "write_whole", killed)
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        kill_after(patch, lambda path, count: path.name == "00000.part.npz")
         patch.setattr(descents, "SAVE_SECONDS", 0.0)
-        with pytest.raises(Killed):
-            run_study(study, tmp_path)
+        run_study(study, tmp_path)
     assert len(store.Store.open(tmp_path).read_part(0)["seconds_0"]) == descents.REPORT_EVERY
     assert load_study(tmp_path).attrs["missing_cells"] == 1
     reports: list[int] = []

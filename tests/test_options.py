@@ -179,10 +179,7 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("compare pusher --backward-s=1", "unknown option --backward-s; did you mean --backward-stiffness?"),
         ("compare pusher --iterations 3", "unknown option --iterations; did you mean --solver-iterations?"),
         ("compare pusher --samples=--", "--samples needs a value, got --"),
-        (
-            "compare pusher --precision float16",
-            "argument --precision: unknown precision 'float16'; did",
-        ),
+        ("compare pusher --precision float16", "argument --precision: unknown precision 'float16'; did"),
         ("compare pusher --devices 1000000", "--devices must be at least 1 and at most 256, got 1000000"),
         ("compare pusher --cone elliptic", "MJX cannot run pusher: condim=1 with ConeType.ELLIPTIC"),
         ("compare pusher --model tennis_racket", "no model named 'tennis_racket'; did you mean tennis?"),

@@ -214,10 +214,7 @@ def joint(**parts: str) -> mujoco.MjModel:
         ({"option": 'noslip_iterations="3"'}, r"noslip_iterations \(set it to 0\)"),
         ({"extension": PID, "actuator": '<plugin joint="j" instance="pid"/>'}, "plugins of actuators"),
         ({"actuator": '<motor joint="j" delay=".02" nsample="2"/>'}, "actuators' delay"),
-        (
-            {"actuator": '<general joint="j" dyntype="filter" dynprm="1" actearly="true"/>'},
-            "actuators' actearly",
-        ),
+        ({"actuator": '<general joint="j" dyntype="filter" dynprm="1" actearly="true"/>'}, "actuators' actearly"),
         ({"actuator": '<motor joint="j" damping="1"/>'}, "actuators' damping and armature"),
         ({"actuator": '<motor joint="j" armature="1"/>'}, "actuators' damping and armature"),
         ({"option": 'actuatorgroupdisable="2"', "actuator": '<motor joint="j" group="2"/>'}, "actuatorgroupdisable"),

@@ -14,14 +14,7 @@ import xarray as xr
 from matplotlib.patches import Rectangle
 
 import mjx_study.report  # noqa: F401  # registers `Dataset.mjx_study`, which no other import here does
-from estimators import (
-    AlphaOrder,
-    Differentiation,
-    DiscontinuityGated,
-    FirstOrder,
-    GradientEstimate,
-    summarise,
-)
+from estimators import AlphaOrder, Differentiation, DiscontinuityGated, FirstOrder, GradientEstimate, summarise
 from estimators.registry import label_of
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document

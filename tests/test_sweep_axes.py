@@ -114,8 +114,7 @@ def test_a_study_from_elsewhere_names_no_file_outside_a_folder(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("values", "digits"),
-    [((1.0, 2.0), 6), ((1e6, 1e6 + 1), 7), ((0.3, 0.1 + 0.2), 17), ((0.1, 0.1), 6), ((), 6)],
+    ("values", "digits"), [((1.0, 2.0), 6), ((1e6, 1e6 + 1), 7), ((0.3, 0.1 + 0.2), 17), ((0.1, 0.1), 6), ((), 6)]
 )
 def test_digits_to_tell_apart(values: tuple[float, ...], digits: int) -> None:
     assert digits_to_tell_apart(values) == digits

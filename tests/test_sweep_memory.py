@@ -94,11 +94,8 @@ from mjx_study.experiment.plan import plan_study
 from tests.documents import numbers_of
 from tests.test_sweep_memory import Stub, config
 
-options = ast.literal_eval(sys.argv[1])
-sampling.Simulator = Stub
-if "block_size" not in options:
-    gradients.GradientComputation._build = lambda *_: None
-plan = plan_study(config(**options))
+sampling.Simulator, gradients.GradientComputation._build = Stub, lambda *_: None
+plan = plan_study(config(**ast.literal_eval(sys.argv[1])))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 numbers_of(plan)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)

@@ -8,10 +8,9 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-import mujoco
 import numpy as np
 
-from mjx_study.authoring.trial import Drive, Trial
+from mjx_study.authoring.trial import Drive, Trial, moments_of, start_of
 
 MOVED: Final = 1e-6
 """Spread of an end that counts as moved by noise [m or rad]."""
@@ -83,7 +82,7 @@ def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequenc
 
 def _candidates(drive: Drive) -> Iterator[tuple[int, str]]:
     """Bodies that a task may be about, the best first."""
-    host, driven = drive.host, _driven(drive.host)
+    host, driven = drive.host, (moments_of(start_of(drive.host)) != 0).any(axis=0)
     dofs = {root: np.flatnonzero(host.body_rootid[host.dof_bodyid] == root) for root in set(host.body_rootid[1:])}
     moving = sorted(int(root) for root, own in dofs.items() if len(own))
     if not drive.at_start:
@@ -96,12 +95,3 @@ def _candidates(drive: Drive) -> Iterator[tuple[int, str]]:
     for body in range(1, host.nbody):
         depth[body] = depth[host.body_parentid[body]] + 1
     yield from ((int(body), "tip") for body in np.argsort(-depth, kind="stable") if host.body_rootid[body] in moving)
-
-
-def _driven(host: mujoco.MjModel) -> np.ndarray:
-    """Whether an actuator acts on each degree of freedom."""
-    data = mujoco.MjData(host)
-    mujoco.mj_forward(host, data)
-    moments = np.zeros((host.nu, host.nv))
-    mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    return (moments != 0).any(axis=0)

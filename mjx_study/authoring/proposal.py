@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mjx_study.authoring.aim import Aim, choose_aim, rounded
-from mjx_study.authoring.trial import MOST_TRIED, SECONDS, Drive, Touch, Trial, run_trial, start_of
+from mjx_study.authoring.trial import MOST_TRIED, SECONDS, Drive, Touch, Trial, moments_of, run_trial, start_of
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.scene import Scene
 
@@ -145,8 +145,7 @@ def _drive(host: mujoco.MjModel) -> Drive:
     neutral = host.key_ctrl[0].copy() if host.nkey else np.zeros(host.nu)
     neutral[limited] = np.clip(neutral, low, high)[limited]
     data = start_of(host)
-    moments = np.zeros((host.nu, host.nv))
-    mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    moments = moments_of(data)
     gain, squares = np.abs(host.actuator_gainprm[:, 0]), np.sum(moments**2, axis=1)
     force = np.abs(moments @ data.qfrc_bias) / np.maximum(squares, mujoco.mjMINVAL)
     motor = (host.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)) & (

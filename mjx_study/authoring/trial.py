@@ -91,6 +91,13 @@ def start_of(host: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
+def moments_of(data: mujoco.MjData) -> Float[np.ndarray, "nu nv"]:
+    """Moment arms of the actuators about the degrees of freedom."""
+    moments = np.zeros((data.model.nu, data.model.nv))
+    mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    return moments
+
+
 def run_trial(drive: Drive, change: Float[np.ndarray, "rows size"], steps: int) -> Trial:
     """Roll out with a change of the neutral controls in every step, or of the initial velocity (one row)."""
     host = copy.copy(drive.host)

@@ -5,7 +5,7 @@ from typing import Final
 
 import jax
 
-from estimators import ESTIMATORS, Estimator
+from estimators import ESTIMATORS, Estimator, oracles_of
 from estimators.merged_samples import EXTREMES
 from mjx_study.limits import MOST_GIB
 from mjx_study.tasks.task import Task
@@ -44,7 +44,7 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
     """Count of numbers held per sample of a batch."""
     params, (steps, dimensions) = task.policy.num_params, task.policy.noise_shape
     noise = steps * dimensions * (1 if task.policy.additive else 1 + params)  # scores, and the policy's Jacobian
-    states = _state_size(task)
+    states = task.scene.host.nq + task.scene.host.nv + task.scene.host.na
     inputs = states + task.scene.host.nu
     each = {
         "evaluation": params + 3,
@@ -57,10 +57,6 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
         "linearisation": 2 * steps + noise + task.horizon * (inputs * (states + 1) + dimensions * states),
     }
     return each[oracle]
-
-
-def _state_size(task: Task) -> int:
-    return task.scene.host.nq + task.scene.host.nv + task.scene.host.na
 
 
 def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int, draws: int = BIAS_DRAWS) -> int:
@@ -95,22 +91,13 @@ def blocks_take(whole: Sequence[str]) -> str:
 
 
 def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, other: int = 0) -> None:
-    """Raise ValueError for arrays that do not fit into `MOST_GIB`, with what to change.
-
-    A task has P parameters, H steps, m controls and a state of size n. Of N samples of all batches held at once, each
-    estimator keeps about 3 N P numbers; those that work step by step N H m more (times P with feedback), and those that
-    linearise N H n (n + m) more. `other` is the number of further numbers kept.
-    """
-    controls, state, params = task.scene.host.nu, _state_size(task), task.policy.num_params
-    needs = {oracle for estimator in estimators for oracle in estimator.needs}
-    each = params * (1 + 3 * len(estimators)) + task.horizon * controls
-    if any("step" in oracle or oracle == "linearisation" for oracle in needs):
-        each += task.horizon * controls * (1 if task.policy.additive else params)
-    if "linearisation" in needs:
-        each += task.horizon * state * (state + controls)
-    gib = 8 * (samples * each + other) / 2**30
+    """Raise ValueError for arrays that do not fit into `MOST_GIB`, with what to change; `other` is the number of
+    further numbers kept."""
+    each = bytes_per_sample(task, oracles_of(estimators, "evaluation"), len(estimators), draws=0)
+    gib = (samples * each + 8 * other) / 2**30
     if gib > MOST_GIB:
         raise ValueError(
-            f"{samples} samples of {params} parameters and {task.horizon} steps need {gib:.3g} GiB of memory, and the "
-            f"limit is {MOST_GIB:g} GiB: use fewer samples, seeds or steps, or split them over several runs"
+            f"{samples} samples of {task.policy.num_params} parameters and {task.horizon} steps need {gib:.3g} GiB of "
+            f"memory, and the limit is {MOST_GIB:g} GiB: use fewer samples, seeds or steps, or split them over several "
+            "runs"
         )

@@ -13,16 +13,9 @@ from mjx_study.gradcheck.check import CONTACT, GradcheckPlan, gradcheck, plan_gr
 from mjx_study.gradcheck.report import Finding, GradcheckReport, StepCheck
 
 __all__ = [
-    "CONTACT",
-    "STIFFNESS",
-    "Finding",
-    "GradcheckPlan",
-    "GradcheckReport",
-    "StepCheck",
-    "gradcheck",
-    "plan_gradcheck",
-    "plan_scene_gradcheck",
-]
+    "CONTACT", "STIFFNESS", "Finding", "GradcheckPlan", "GradcheckReport", "StepCheck", "gradcheck",
+    "plan_gradcheck", "plan_scene_gradcheck",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -20,16 +20,6 @@ from mjx_study.objective.cost import rollout_cost, simulate
 from mjx_study.objective.programs import SamplePrograms
 
 __all__ = [
-    "BlankObjective",
-    "MAX_CHUNK",
-    "MjxObjective",
-    "SamplePrograms",
-    "Simulator",
-    "TracedObjective",
-    "chunk_for",
-    "compiled_rollout",
-    "contact_for",
-    "rollout_cost",
-    "simulate",
-    "spread",
-]
+    "BlankObjective", "MAX_CHUNK", "MjxObjective", "SamplePrograms", "Simulator", "TracedObjective", "chunk_for",
+    "compiled_rollout", "contact_for", "rollout_cost", "simulate", "spread",
+]  # fmt: skip

@@ -115,7 +115,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_contact_options(
         self,
-        stiffness: str = "the task's sweep",
+        stiffness: str = SWEEP,
         contact: str = UNSET_TASK,
         *,
         many: bool = True,

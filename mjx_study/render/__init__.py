@@ -10,14 +10,6 @@ from mjx_study.render.motion import VIEWS, Motion, choose_view, resolve_view
 from mjx_study.render.opengl import RenderError, resolve_renderer
 
 __all__ = [
-    "VIEWS",
-    "Motion",
-    "RenderError",
-    "animate",
-    "check_format",
-    "choose_view",
-    "resolve_renderer",
-    "resolve_view",
-    "strip",
-    "stroboscope",
-]
+    "VIEWS", "Motion", "RenderError", "animate", "check_format", "choose_view", "resolve_renderer", "resolve_view",
+    "strip", "stroboscope",
+]  # fmt: skip

@@ -10,9 +10,5 @@ jax.config.update("jax_enable_x64", True)
 
 @pytest.fixture(autouse=True)
 def strict_arrays() -> Iterator[None]:
-    with (
-        jax.numpy_rank_promotion("raise"),
-        jax.numpy_dtype_promotion("strict"),
-        jax.debug_key_reuse(True),
-    ):
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"), jax.debug_key_reuse(True):
         yield

@@ -69,8 +69,7 @@ def test_every_estimator_calls_the_oracles_that_it_names_with_independent_keys(n
     assert len(np.unique(keys, axis=0)) == 20 * len({oracle.order for oracle in needs})
     batches = draw(tuple(oracle.name for oracle in needs), OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 20)
     np.testing.assert_array_equal(
-        made(name)(batches).mean,
-        estimate(made(name), OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 20).mean,
+        made(name)(batches).mean, estimate(made(name), OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 20).mean
     )
 
 
@@ -244,16 +243,8 @@ def test_missing_batches_and_impossible_sizes_are_refused():
         ("aobg", {"gamma": 0.0}, "gamma must be positive; got 0.0"),
         ("aobg", {"gamma": float("nan")}, "gamma must be positive; got nan"),
         ("aobg", {"failure_probability": 1.5}, "failure_probability must be positive and less than 1; got 1.5"),
-        (
-            "aobg",
-            {"variance_proxy": "sum"},
-            "unknown variance proxy 'sum'; choose from variance, second",
-        ),
-        (
-            "aobg",
-            {"variance_proxy": "upper_bound"},
-            "'upper_bound' requires a `radius`: .* got 'max_deviation'",
-        ),
+        ("aobg", {"variance_proxy": "sum"}, "unknown variance proxy 'sum'; choose from variance, second"),
+        ("aobg", {"variance_proxy": "upper_bound"}, "'upper_bound' requires a `radius`: .* got 'max_deviation'"),
         ("delta", {"sigma": 0.0}, "sigma must be positive and finite; got 0.0"),
         ("fobg_clipped", {"max_norm": float("inf")}, "max_norm must be positive and finite; got inf"),
         ("fobg_truncated", {"window": 0}, "window must be at least 1 and at most 1000000; got 0"),

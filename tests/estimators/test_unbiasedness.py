@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 from jax import Array
 
-from estimators import (
-    BASELINES,
-    Evaluation,
-    Objective,
-    delta_control_variate,
-    first_order,
-    interpolate,
-    zeroth_order,
-)
+from estimators import BASELINES, Evaluation, Objective, delta_control_variate, first_order, interpolate, zeroth_order
 from tests.estimators import objectives
 from tests.estimators.statistics_helpers import assert_mean_is
 

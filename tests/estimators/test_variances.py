@@ -175,9 +175,7 @@ def test_variance_of_the_mean_is_the_sample_variance_over_n(num_samples: int):
     assert_mean_is(squares[:, None], [exact / num_samples], resolution=0.1)
     assert_mean_is(np.asarray(estimates.variance)[:, None], [exact], resolution=0.1)
     assert_mean_is(
-        np.sum(np.asarray(estimates.standard_error) ** 2, axis=1)[:, None],
-        [exact / num_samples],
-        resolution=0.1,
+        np.sum(np.asarray(estimates.standard_error) ** 2, axis=1)[:, None], [exact / num_samples], resolution=0.1
     )
 
 

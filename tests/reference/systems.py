@@ -23,11 +23,6 @@ def differentiate(function: Callable[[float], np.ndarray], step: float) -> np.nd
     return (4 * quotient(step / 2) - quotient(step)) / 3
 
 
-def relative(actual, expected) -> float:
-    """||actual - expected|| / ||expected||."""
-    return float(np.linalg.norm(np.asarray(actual) - np.asarray(expected)) / np.linalg.norm(np.asarray(expected)))
-
-
 def symmetric(size: int, rng: np.random.Generator) -> np.ndarray:
     """A random positive definite matrix."""
     root = rng.standard_normal((size, size))
@@ -167,12 +162,7 @@ ROLLOUTS = {
         DoublePendulum(timestep=0.01), np.array([1.5, 0.2, 2.0, -3.0]), np.zeros((100, 0)), None, _no_events
     ),
     "tennis": RolloutCase(
-        Tennis(),
-        BALL,
-        0.05 * RNG.standard_normal((45, 3)),
-        0.05 * RNG.standard_normal((3, 7)),
-        tennis_events,
-        1e-5,
+        Tennis(), BALL, 0.05 * RNG.standard_normal((45, 3)), 0.05 * RNG.standard_normal((3, 7)), tennis_events, 1e-5
     ),
     "linear_quadratic": RolloutCase(
         LINEAR_QUADRATIC,

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mjx_study.reference import DoublePendulum, roll_out, value_and_gradients
-from tests.reference.systems import differentiate, relative
+from tests.pusher_fixtures import relative
+from tests.reference.systems import differentiate
 
 START = np.array([np.pi / 2, 0.0, 5.0, -5.0])
 RNG = np.random.default_rng(0)

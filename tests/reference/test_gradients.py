@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mjx_study.reference import Rollout, System, Tennis, roll_out, value_and_gradients
-from tests.reference.systems import ROLLOUTS, STEPS, RolloutCase, StepCase, differentiate, relative
+from tests.pusher_fixtures import relative
+from tests.reference.systems import ROLLOUTS, STEPS, RolloutCase, StepCase, differentiate
 
 TOLERANCE = 1e-8  # relative to a column's norm; truncation and rounding of the quotients are below 1e-10 of it
 STEP = 1e-4
