@@ -39,18 +39,20 @@ RIGHT: dict[str, float] = {
     [
         ({}, "right"),
         ({"mean": 2.0, "mean_of_strata": 2.0}, "biased"),
-        ({"mean": 1.05, "mean_of_strata": 1.05}, "unknown"),
+        ({"mean": 1.05, "mean_of_strata": 1.05}, "close"),
+        ({"mean": 1.05, "mean_of_strata": 1.05, "mean_error": 0.03}, "unknown"),
         ({"point_share": 0.0}, "average"),
         ({"point_share": 0.0, "mean": 2.0, "mean_of_strata": 2.0}, "wrong"),
         ({"slope_by_differences": 1.04}, "unknown"),
-        ({"mean": 2.0, "mean_of_strata": 2.1}, "unknown"),
+        ({"mean": 2.0, "mean_of_strata": 2.6}, "unknown"),
         ({"mean": math.nan}, "unknown"),
+        ({"mean": math.nan, "nan_share": 1.0}, "none"),
     ],
 )
 def test_verdicts(changes: dict[str, float], said: str) -> None:
     assert verdict(RIGHT | changes) == said
-    assert combined([RIGHT | changes] * 2, 2) == said
-    assert combined([RIGHT | changes], 2) == "unknown"
+    assert combined([RIGHT | changes] * 2) == said
+    assert combined([RIGHT | changes, None]) == f"{said}, -"
 
 
 def test_the_page_says_what_the_data_give() -> None:
@@ -76,7 +78,7 @@ print(json.dumps([found.positions[0, 0].tolist(), float(found.values[0]), float(
 """
 
 
-@pytest.mark.parametrize("name", ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap"])
+@pytest.mark.parametrize("name", ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap", "nimble"])
 def test_free_flight_of_what_is_installed(name: str) -> None:
     engine = catalog.ENGINES[name]
     python = catalog.interpreter(engine)

@@ -34,7 +34,6 @@ class Engine:
         adapter: module in `adapters`, and variant.
         how: way of differentiation, as the engine's documentation has it.
         single: whether it computes in float32.
-        slow: whether rollouts are one at a time, so that fewer must do.
     """
 
     label: str
@@ -43,7 +42,6 @@ class Engine:
     variant: str
     how: str
     single: bool = False
-    slow: bool = False
 
 
 ENVIRONMENTS: Final = {
@@ -53,8 +51,10 @@ ENVIRONMENTS: Final = {
     "old_mjx": Environment(
         ("mujoco-mjx==3.1.6", "mujoco==3.1.6", "jax==0.4.30", "jaxlib==0.4.30", "numpy<2", "scipy<1.13")
     ),
+    "newton_1_0": Environment(("newton==1.0.0", "warp-lang==1.12.0")),
     "newton": Environment(("newton==1.8.0", "warp-lang==1.19.0")),
     "jaxsim": Environment(("jaxsim==0.9.0", "jax==0.10.2", "jaxlib==0.10.2")),
+    "nimble": Environment(("nimblephysics==0.10.52.1", "torch==2.14.1", "numpy<2"), ("3.10",)),
     "drake": Environment(("drake==1.58.0",), ("3.12",)),
 }
 ENGINES: Final = {
@@ -67,18 +67,24 @@ ENGINES: Final = {
         for law in ("hunt_crossley", "kelvin_voigt", "log_barrier", "conic")
     },
     **{
-        f"brax_{name}": Engine(f"brax 0.14.2, {name}", "brax", "brax_pipelines", name, "reverse mode")
-        for name in ("spring", "positional", "generalized")
+        f"brax_{name}": Engine(f"brax 0.14.2, {name}", "brax", "brax_pipelines", name, mode)
+        for name, mode in (
+            ("spring", "reverse mode"),
+            ("positional", "reverse mode"),
+            ("generalized", "reverse mode, 1e-6 rad/s of spin"),
+        )
     },
     **{
         f"newton_{name}": Engine(f"Newton 1.8.0, {name}", "newton", "newton_warp", name, "Warp's tape", single=True)
         for name in ("semi_implicit",)
     },
+    "newton_1_0": Engine("Newton 1.0.0, semi_implicit", "newton_1_0", "newton_warp", "old", "Warp's tape", single=True),
     "jaxsim": Engine("JaxSim 0.9.0, soft", "jaxsim", "jaxsim_soft", "SemiImplicitEuler", "reverse mode"),
     **{
-        f"drake_{name}": Engine(f"Drake 1.58.0, {name}", "drake", "drake_plant", name, "AutoDiffXd", slow=True)
+        f"drake_{name}": Engine(f"Drake 1.58.0, {name}", "drake", "drake_plant", name, "AutoDiffXd")
         for name in ("sap",)
     },
+    "nimble": Engine("Nimble 0.10.52", "nimble", "nimble_physics", "lcp", "torch's tape"),
     "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode"),
 }
 

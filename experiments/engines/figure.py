@@ -23,14 +23,14 @@ def main() -> None:
         for row, name in enumerate(names):
             cell = toss.get((name, "toss", step))
             ratio = cell["mean"] / cell["slope"] if cell else float("nan")
-
             at = row + 0.4 * i - 0.2
-            if cell and 0 < ratio < 12:
-                faint = 0.4 if verdict(cell) == "unknown" else 1.0
+            said = verdict(cell) if cell else "not measured"
+            if -1 < ratio < 12 and said != "no contact":
+                faint = 0.4 if said == "unknown" else 1.0
                 axes.barh(at, ratio, 0.38, color=f"C{i}", alpha=faint, label=f"{1000 * step:g} ms" if not row else None)
             else:
-                missing = "not shown: NaN, negative or above 12" if cell else "not measured"
-                axes.text(1.1, at, missing, va="center", fontsize=7)
+                kept = said in ("not measured", "no contact")
+                axes.text(1.1, at, said if kept else "not shown: NaN, below -1 or above 12", va="center", fontsize=7)
     axes.axvline(1, color="black", linewidth=1)
     axes.set_yticks(range(len(names)), [ENGINES[name].label for name in names])
     axes.invert_yaxis()

@@ -29,8 +29,8 @@ def tables(found: Cells) -> dict[str, str]:
     """Return the page's tables: verdicts by engine and scene, and the numbers of each scene."""
     matrix = [markdown_row("engine", "differentiated in", *SHOWN), "|---" * (len(SHOWN) + 2) + "|"]
     for name, engine in ENGINES.items():
-        rows = [[found[key] for step in TIMESTEPS if (key := (name, scene, step)) in found] for scene in SHOWN]
-        matrix.append(markdown_row(engine.label, engine.how, *(combined(row, len(TIMESTEPS)) for row in rows)))
+        rows = [[found.get((name, scene, step)) for step in TIMESTEPS] for scene in SHOWN]
+        matrix.append(markdown_row(engine.label, engine.how, *map(combined, rows)))
     return {"matrix": "\n".join(matrix), **{scene: _numbers(found, scene) for scene in SHOWN}}
 
 

@@ -1,4 +1,5 @@
-"""Measure one cell, in the environment of its engine: prints one line of JSON.
+"""Measure one cell, in the environment of its engine: prints one line of JSON. What is undecided is measured once more,
+on a grid four times as fine.
 
 python -m experiments.engines.worker ENGINE SCENE TIMESTEP [quick]
 """
@@ -9,7 +10,7 @@ import sys
 from importlib import import_module
 
 from experiments.engines.catalog import ENGINES
-from experiments.engines.judge import FEW, MANY, measure
+from experiments.engines.judge import FEW, MANY, MORE, measure, verdict
 from experiments.engines.scenes import SCENES, CannotError
 
 
@@ -20,11 +21,12 @@ def main() -> None:
     name, scene, timestep = sys.argv[1:4]
     engine = ENGINES[name]
     build = import_module(f"experiments.engines.adapters.{engine.adapter}").build
-    counts = FEW if sys.argv[4:] or engine.slow else MANY
+    counts = FEW if sys.argv[4:] else MANY
     try:
-        found = measure(
-            build(SCENES[scene], float(timestep), engine.variant), SCENES[scene], counts, single=engine.single
-        )
+        simulate = build(SCENES[scene], float(timestep), engine.variant)
+        found = measure(simulate, SCENES[scene], counts, single=engine.single)
+        if counts is MANY and verdict(found | {"scene": scene}) == "unknown":
+            found = measure(simulate, SCENES[scene], MORE, single=engine.single)
     except CannotError as error:
         found = {"error": str(error), "verdict": "none" if "derivative" in str(error) else "unknown"}
     print(json.dumps({"engine": name, "scene": scene, "timestep": float(timestep), **found}))

@@ -6,6 +6,9 @@ from typing import Any
 from experiments.engines.adapters.jax_common import batched
 from experiments.engines.scenes import Scene, Simulate, mjcf, mjcf_index, mjcf_state
 
+SPIN = 1e-6
+"""Angular velocity at the start of `generalized` [rad/s], whose derivative at rest is NaN."""
+
 
 def build(scene: Scene, timestep: float, variant: str) -> Simulate:
     """Return rollouts by one of the pipelines, with their own elasticity in place of a restitution."""
@@ -13,6 +16,8 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
     loader: Any = import_module("brax.io.mjcf")
     is_velocity, index = mjcf_index(scene)
     qpos, qvel = mjcf_state(scene, scene.center)
+    if variant == "generalized" and len(qpos) > 1:
+        qvel[3:6] = SPIN
 
     def final_positions(jax, theta):
         jnp = jax.numpy

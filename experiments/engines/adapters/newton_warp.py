@@ -1,6 +1,9 @@
-"""Newton on NVIDIA Warp's tape, on a CPU and in float32: variants `semi_implicit` and `xpbd`.
+"""Newton on NVIDIA Warp's tape, on a CPU and in float32: variants `semi_implicit`, `xpbd`, and `old`,
+Newton 1.0.0, whose gravity is a number.
 
-Materials are Newton's defaults but for friction; the spheres of one call are worlds of one model.
+Stiffness and damping are Newton's defaults, shared among the points of a contact. The gain of friction is `GAIN`: its
+default, 1000 N s/m, is beyond what explicit steps of 5 and 2 ms of 1 kg bear. The bodies of one call are worlds of one
+model.
 """
 
 import math
@@ -13,6 +16,10 @@ from experiments.engines.scenes import RADIUS, CannotError, Rollout, Scene, Simu
 
 WORLDS = 100
 """Rollouts that are simulated at once."""
+GAIN = 50.0
+"""Friction per slip speed [N s/m]: a sphere's contact has an effective mass of 2/7 kg, and steps of 5 ms bear 114."""
+STIFFNESS, DAMPING = 2500.0, 100.0
+"""Newton's defaults [N/m, N s/m]."""
 
 
 def build(scene: Scene, timestep: float, variant: str) -> Simulate:
@@ -20,13 +27,19 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
     wp: Any = import_module("warp")
     newton: Any = import_module("newton")
     wp.config.quiet = True
-    if [body.shape for body in scene.bodies] != ["sphere"]:
-        raise CannotError("this adapter builds one sphere alone")
-    density = 1 / (4 / 3 * math.pi * RADIUS**3)
-    ball = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -scene.gravity))
-    config = ball.ShapeConfig(density=density, mu=scene.friction, restitution=scene.restitution)
-    ball.add_shape_sphere(ball.add_body(), radius=RADIUS, cfg=config)
-    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -scene.gravity))
+    (shape, tilt), *others = ((body.shape, body.tilt) for body in scene.bodies)
+    if others or tilt or shape not in ("sphere", "box"):
+        raise CannotError("this adapter builds one sphere or one level box alone")
+    points, volume = (4, (2 * RADIUS) ** 3) if shape == "box" else (1, 4 / 3 * math.pi * RADIUS**3)
+    gravity: Any = -scene.gravity if variant == "old" else (0.0, 0.0, -scene.gravity)
+    ball = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=gravity)
+    forces = {"ke": STIFFNESS / points, "kd": DAMPING / points, "kf": GAIN / points}
+    config = ball.ShapeConfig(density=1 / volume, mu=scene.friction, restitution=scene.restitution, **forces)
+    if shape == "box":
+        ball.add_shape_box(ball.add_body(), hx=RADIUS, hy=RADIUS, hz=RADIUS, cfg=config)
+    else:
+        ball.add_shape_sphere(ball.add_body(), radius=RADIUS, cfg=config)
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=gravity)
     for _ in range(WORLDS):
         builder.add_world(ball)
     if scene.floor:
