@@ -148,12 +148,14 @@ def chunk_of(task: Task, samples: int) -> int:
 def affordable(seconds: float, chunk: int) -> int:
     """Number of samples that fit into `BUDGET_SECONDS`, at theta and along all paths, but at least one call per path.
 
+    The number of calls is the nearest power of two, so that the next run mostly has as many and draws the same numbers.
+
     Args:
         seconds: time of one call of all programs [s].
         chunk: number of samples in it, including a baseline.
     """
-    calls = max(1, round(BUDGET_SECONDS / (seconds * MAX_PATHS * (NODES + 1))))
-    return min(SAMPLES, MAX_PATHS * chunk * calls - 1)
+    calls = max(1.0, BUDGET_SECONDS / (seconds * MAX_PATHS * (NODES + 1)))
+    return min(SAMPLES, MAX_PATHS * chunk * 2 ** round(math.log2(calls)) - 1)
 
 
 def measure(
