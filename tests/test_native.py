@@ -27,8 +27,8 @@ from tests.test_graph import FUNCTIONS, ROW
 
 pytestmark = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
 
-SPECIAL = [0.0, -0.0, 1.0, -1.0, 2.0, 0.3, -0.7, 2.5, -2.5, 3.5]
-SPECIAL += [1e300, -1e300, 5e-324, -1e-310, np.inf, -np.inf, np.nan]
+EXTREME = [1e300, -1e300, 5e-324, -1e-310, np.inf, -np.inf, np.nan]
+SPECIAL = [0.0, -0.0, 1.0, -1.0, 2.0, 0.3, -0.7, 2.5, -2.5, 3.5, *EXTREME]
 UNIT = [0.0, -0.0, 1.0, -1.0, 0.3, -0.7, 1e-9, 5e-324, np.nan, 1.5]
 INTEGERS = [0, 1, -1, 7, -7, 2**31 - 1, -(2**31)]
 FLOATS = {

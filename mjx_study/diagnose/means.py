@@ -208,9 +208,16 @@ def check_terms(
             corrected = CORRECTED in estimator.needs or (task.onset != "none" and reads_onset([estimator]))
             if not (corrected and np.all(np.isfinite(at.theta))):
                 continue
-            common = {"samples": cell.samples, "seed": plan.config.seed, "chunk_size": plan.chunk_size}
             paths = check_mean(
-                at, [cell.model], [estimator], names=[name], direction=ALONG_MEANS, progress=progress, **common
+                at,
+                [cell.model],
+                [estimator],
+                samples=cell.samples,
+                seed=plan.config.seed,
+                names=[name],
+                direction=ALONG_MEANS,
+                chunk_size=plan.chunk_size,
+                progress=progress,
             )
             found.append(max(paths, key=lambda each: abs(float(each.circulation.gap))))
     return found
