@@ -51,6 +51,7 @@ LEG: Final = """
   <actuator><position name="hip" joint="hip" kp="60" kv="2" ctrlrange="-1 1"/>
     <position name="knee" joint="knee" kp="60" kv="2" ctrlrange="-1 1"/></actuator>
   <keyframe><key qpos="0 0 0.1 0" qvel="0.5 0 0 0" ctrl="0.1 0"/></keyframe></mujoco>"""
+AXES: Final = ("0 0 1", "0 1 0", "0 1 0")
 BALL: Final = (
     f'<mujoco model="ball">{FLOOR}<body name="ball" pos="0 0 .2"><freejoint/><geom name="ball" size=".1" mass=".5"/>'
     "</body></worldbody></mujoco>"
@@ -162,6 +163,17 @@ def test_what_a_task_is_about() -> None:
     assert leg.drive.scale == 0.1 and 0 < leg.aim.goal[0] - leg.aim.end[0] < 1
     assert pendulum.aim.role == "tip" and wheel.aim.body is None and wheel.aim.role == "coordinate"
     assert proposed(LIMITED).limits == ("swing",)
+
+
+def test_a_straight_arms_goal_is_within_reach() -> None:
+    """Its tip cannot go further out than it is."""
+    joints = [f'<joint name="{name}" axis="{axis}" damping=".5"/>' for name, axis in zip("ype", AXES, strict=True)]
+    link = '<geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" contype="0" conaffinity="0"/>'
+    world = f'<body>{joints[0]}{joints[1]}{link}<body pos=".3 0 0">{joints[2]}{link}</body></body>'
+    servos = "".join(f'<position joint="{name}" kp="40" kv="2" ctrlrange="-1 2"/>' for name in "ype")
+    text = f"<mujoco><worldbody>{world}</worldbody><actuator>{servos}</actuator></mujoco>"
+    aim = proposed(text).aim
+    assert aim.axis == 0 and aim.side == -1 and aim.goal[0] < aim.end[0]
 
 
 def test_contacts_are_those_of_a_fall() -> None:

@@ -18,6 +18,8 @@ TYPICAL: Final = 1.5
 """Standard deviation of normal numbers in median absolute deviations; a single fall or throw does not count."""
 LEAST: Final = 0.02
 """Least distance of a goal, in extents of the model."""
+REACHED: Final = 0.25
+"""Share of the ends under held controls from which on a side counts as within reach; else the goal is on the other."""
 FORWARD: Final = 0.3
 """Share of the greatest spread along an axis from which on the x axis is preferred."""
 
@@ -32,6 +34,7 @@ class Aim:
         axis: axis of the world (0 to 2), or index in qpos.
         end: where it ends by itself [m, or unit of qpos]; all three axes for a body.
         distance: how far the goal is from there along the axis.
+        side: 1 or -1, the direction along the axis.
     """
 
     body: int | None
@@ -39,12 +42,15 @@ class Aim:
     axis: int
     end: tuple[float, ...]
     distance: float
+    side: int = 1
 
     @property
     def goal(self) -> tuple[float, ...]:
         """Three coordinates of a body, or one of qpos."""
         moved = self.axis if self.body is not None else 0
-        return tuple(rounded(value + self.distance * (place == moved)) for place, value in enumerate(self.end))
+        return tuple(
+            rounded(value + self.side * self.distance * (place == moved)) for place, value in enumerate(self.end)
+        )
 
     def misses(self, trial: Trial, steps: int) -> float:
         """Squared distance from the goal, in units of the distance."""
@@ -72,12 +78,19 @@ def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequenc
         if np.std(ends, axis=0).max() > MOVED:
             axis = 0 if spread[0] >= FORWARD * spread.max() else int(np.argmax(spread))
             end = tuple(quiet.centres[steps, body].tolist())
-            return Aim(body, role, axis, end, rounded(max(spread[axis], LEAST * drive.host.stat.extent), 1))
+            distance = rounded(max(spread[axis], LEAST * drive.host.stat.extent), 1)
+            return Aim(body, role, axis, end, distance, _side(far[:, axis], end[axis]))
     ends, far = (np.array([each.qpos[steps] for each in trials]) for trials in (noisy, held))
     axis = int(np.argmax(np.std(ends, axis=0)))
     if min(np.std(ends[:, axis]), np.std(far[:, axis])) <= MOVED:
         return None
-    return Aim(None, "coordinate", axis, (float(quiet.qpos[steps, axis]),), rounded(float(np.std(far[:, axis])), 1))
+    end, distance = float(quiet.qpos[steps, axis]), rounded(float(np.std(far[:, axis])), 1)
+    return Aim(None, "coordinate", axis, (end,), distance, _side(far[:, axis], end))
+
+
+def _side(ends: np.ndarray, end: float) -> int:
+    """The side on which a goal is within reach: forward, unless hardly any rollout ends there, as of a straight arm."""
+    return 1 if np.mean(ends > end) >= REACHED else -1
 
 
 def _candidates(drive: Drive) -> Iterator[tuple[int, str]]:
