@@ -77,7 +77,7 @@ def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequenc
         spread = TYPICAL * np.median(np.abs(far - np.median(far, axis=0)), axis=0)
         if np.std(ends, axis=0).max() > MOVED:
             axis = 0 if spread[0] >= FORWARD * spread.max() else int(np.argmax(spread))
-            end = tuple(quiet.centres[steps, body].tolist())
+            end = tuple(np.round(quiet.centres[steps, body], 9).tolist())  # without what rounding leaves of 0
             distance = rounded(max(spread[axis], LEAST * drive.host.stat.extent), 1)
             return Aim(body, role, axis, end, distance, _side(far[:, axis], end[axis]))
     ends, far = (np.array([each.qpos[steps] for each in trials]) for trials in (noisy, held))

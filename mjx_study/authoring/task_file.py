@@ -19,8 +19,6 @@ IMPORTED: Final = frozenset({"Path", "jnp", "replace", "study"})
 """Names of the file's imports."""
 _JOINT: Final = int(mujoco.mjtTrn.mjTRN_JOINT)
 AXES: Final = ("x", "y", "z")
-NEGLIGIBLE: Final = 1e-9
-"""Coordinates that are shown as 0 [m]."""
 MOST_LISTED: Final = 8
 """Maximum number of contacts listed."""
 
@@ -161,7 +159,7 @@ def _costs(found: Proposal) -> Iterator[str]:
     else:
         name = host.body(aim.body).name
         index = f"scene.body({_quoted(name)})" if name else str(aim.body)
-        where = ", ".join(number(value if abs(value) > NEGLIGIBLE else 0.0, 3) for value in aim.end)
+        where = ", ".join(number(value, 3) for value in aim.end)
         yield f"    body = {index}  # the {aim.role}"
         yield f"    # By itself its centre of mass ends at ({where}) m."
         yield f"    # The goal is {distance} m {'further' if aim.side > 0 else 'back'} along {AXES[aim.axis]}."

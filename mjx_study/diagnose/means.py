@@ -21,7 +21,7 @@ from estimators.mean_check import TOLERANCE, Circulation, circulations
 from estimators.registry import label_of
 from mjx_study.diagnose.columns import MEANS
 from mjx_study.experiment.resolution import check_estimators, direction_of
-from mjx_study.experiment.sampling import cell_keys, draw_batches
+from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches
 from mjx_study.experiment.study import StudyPlan, estimators_of
 from mjx_study.experiment.unused_options import CORRECTED, reads_onset
 from mjx_study.objective import Simulator, chunk_for
@@ -139,7 +139,6 @@ def check_mean(
     span: Sequence[float] | None = None,
     direction: str = "random",
     tolerance: float = TOLERANCE,
-    chunk_size: int | None = None,
     progress: Progress = silent,
 ) -> list[MeanCheck]:
     """Check every estimator for every contact model.
@@ -155,7 +154,6 @@ def check_mean(
             noise to either side, or 0.02 for noise on the controls.
         direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
         tolerance: share of the cost's difference within which a mean is right.
-        chunk_size: samples per program call, such as that of programs built before; by default chosen.
         progress: called with (contact models done, their total number, label of the next).
 
     Raises:
@@ -166,17 +164,13 @@ def check_mean(
     low, high = span or (-reach_of(task), reach_of(task))
     axis = "random" if direction == ALONG_MEANS else direction
     along = jnp.asarray(direction_of(axis, task.policy.num_params, seed), task.theta.dtype)
-    simulator = Simulator(task, chunk_size=chunk_size or chunk_for(samples, local_devices(), [task]))
+    simulator = Simulator(task, chunk_size=chunk_for(samples, local_devices(), [task]))
     found, ends = [], (task.theta + low * along, task.theta + high * along)
     for index, cell in enumerate(cells):
         progress(index, len(cells), cell.label)
         objective, key = simulator.objective(cell.contact), jax.random.key(seed)
         if direction == ALONG_MEANS:
-            batches, _, _ = draw_batches(
-                objective, task.theta, cell_keys(seed, 1), oracles_of(estimators), samples, slice(1)
-            )
-            estimates = unmixed(estimators, jax.tree.map(lambda leaf: leaf[0], batches))
-            paths = along_means(estimators, objective, task.theta, reach_of(task), estimates, samples, seed)
+            paths = _along_own(estimators, objective, task.theta, reach_of(task), samples, seed)
         else:
             paths = [circulations(estimators, objective, *ends, key, samples)]
         found += [
@@ -188,38 +182,45 @@ def check_mean(
     return found
 
 
+def _along_own(
+    estimators: Sequence[Estimator], objective: Any, theta: Array, reach: float, samples: int, seed: int
+) -> list[list[Circulation]]:
+    """`along_means` with estimates from a batch of their own."""
+    batches, _, _ = draw_batches(objective, theta, cell_keys(seed, 1), oracles_of(estimators), samples, slice(1))
+    estimates = unmixed(estimators, jax.tree.map(lambda leaf: leaf[0], batches))
+    return along_means(estimators, objective, theta, reach, estimates, samples, seed)
+
+
 def check_terms(
     plan: StudyPlan, thetas: Mapping[str, Sequence[float]] = MappingProxyType({}), progress: Progress = silent
 ) -> list[MeanCheck]:
-    """Check the means of a study's estimators that have an onset term, along themselves, with the study's samples.
+    """Check the means of a study's estimators that have an onset term, along themselves, with as many samples.
 
-    Of up to three paths, the result has the one with the largest gap. It needs no reference gradient.
+    It needs no reference gradient.
 
     Args:
         thetas: parameters at which to check, by estimator; by default the task's.
-        progress: as for `check_mean`.
+        progress: called with (checks done, their total number, label of the next) if there are any.
     """
-    found = []
-    for cell in [each for each in plan.cells if not each.model.analytic]:
-        chosen = zip(plan.config.estimator_names, estimators_of(plan, cell), strict=True)
-        for name, estimator in chosen:
-            task = plan.task_of(cell).replace(sigma=cell.sigma)
-            at = task.replace(theta=jnp.asarray(thetas.get(name, task.theta), task.theta.dtype))
-            corrected = CORRECTED in estimator.needs or (task.onset != "none" and reads_onset([estimator]))
-            if not (corrected and np.all(np.isfinite(at.theta))):
-                continue
-            paths = check_mean(
-                at,
-                [cell.model],
-                [estimator],
-                samples=cell.samples,
-                seed=plan.config.seed,
-                names=[name],
-                direction=ALONG_MEANS,
-                chunk_size=plan.chunk_size,
-                progress=progress,
-            )
-            found.append(max(paths, key=lambda each: abs(float(each.circulation.gap))))
+    objectives, found = Objectives(plan), []
+    chosen = [
+        (cell, name, estimator)
+        for cell in plan.cells
+        if not cell.model.analytic
+        for name, estimator in zip(plan.config.estimator_names, estimators_of(plan, cell), strict=True)
+        if CORRECTED in estimator.needs or (plan.task_of(cell).onset != "none" and reads_onset([estimator]))
+    ]
+    for index, (cell, name, estimator) in enumerate(chosen):
+        progress(index, len(chosen), cell.model.label)
+        task = plan.task_of(cell).replace(sigma=cell.sigma)
+        theta = jnp.asarray(thetas.get(name, task.theta), task.theta.dtype)
+        if np.all(np.isfinite(theta)):
+            drawn = cell.samples, plan.config.seed
+            ((circulation,),) = _along_own([estimator], objectives(cell), theta, reach_of(task), *drawn)
+            place = cell.model.family, cell.model.stiffness_or_zero
+            found.append(MeanCheck(*place, name, circulation, circulation.verdict()))
+    if chosen:
+        progress(len(chosen), len(chosen), "done")
     return found
 
 

@@ -293,14 +293,6 @@ def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 @jax.jit
-def motion(model: mjx.Model, data: mjx.Data, qpos: Qpos, qvel: Qvel) -> mjx.Data:
-    """Positions and velocities of bodies."""
-    with patched():
-        data = mjx.com_pos(model, mjx.kinematics(model, data.replace(qpos=qpos, qvel=qvel)))
-        return mjx.com_vel(model, data)
-
-
-@jax.jit
 def force_stage(model: mjx.Model, data: mjx.Data, qvel: Qvel, act: Act, control: Control) -> mjx.Data:
     data = data.replace(qvel=qvel, act=act, ctrl=control)
     with patched():

@@ -23,7 +23,7 @@ from estimators.choices import suggestion
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
-from mjx_study.simulation.dynamics import Act, Control, Qpos, State, acceleration, entry_by_entry, motion, smooth_stages
+from mjx_study.simulation.dynamics import Act, Control, Qpos, State, acceleration, entry_by_entry, smooth_stages
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
 
@@ -160,9 +160,17 @@ def observed(
     return ObservedState(state.qpos, state.qvel, state.act, state.warmstart, scene, contact, control)
 
 
+@jax.jit
+def _moving(model: mjx.Model, data: mjx.Data, qpos: Qpos, qvel: Array) -> mjx.Data:
+    """Positions and velocities of bodies; jitted so that JAX traces them once for all quantities."""
+    with patched():
+        data = mjx.com_pos(model, mjx.kinematics(model, data.replace(qpos=qpos, qvel=qvel)))
+        return mjx.com_vel(model, data)
+
+
 def _motion(scene: Scene, name: str, model: mjx.Model, qpos: Qpos, qvel: Array | None = None) -> Float[Array, "..."]:
     """A quantity of positions, or with qvel of velocities."""
-    data = motion(model, scene.template, qpos, scene.template.qvel if qvel is None else qvel)
+    data = _moving(model, scene.template, qpos, scene.template.qvel if qvel is None else qvel)
     if name in POSITIONS:
         return getattr(data, name)
     if name == "cvel":
