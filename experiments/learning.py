@@ -3,7 +3,7 @@
     python -m experiments.learning tune walk zobg >> learning.jsonl                   # the grid, 3 seeds of each pair
     python -m experiments.learning learn walk zobg learning.jsonl >> learning.jsonl   # its best pair, 12 new seeds
     python -m experiments.learning ppo walk ppo 1e-3 0 >> learning.jsonl              # pip install stable-baselines3
-    python -m experiments.learning report learning.jsonl                              # tables, and docs/learning.png
+    python -m experiments.learning report learning.jsonl                              # its tables and figure
 
 All descents of a method run in one program, on one device. An iteration takes `SAMPLES` rollouts, differentiated or
 not. The adjoint of first-order gradients is cut every few steps, as in analytic policy gradients.
@@ -34,7 +34,7 @@ from estimators import Differentiation, Estimator, Evaluation, make_estimator, n
 from estimators.sampling import draw
 from experiments import DOCS
 from experiments.figures.rollouts import INK
-from experiments.pages import DPI
+from experiments.pages import DPI, write_tables
 from mjx_study.objective.cost import before_each_step, last_of, rollout_cost
 from mjx_study.plots.style import style_of
 from mjx_study.table import markdown_table
@@ -58,8 +58,9 @@ RATES: Final = (2e-3, 5e-3, 1e-2)
 """Learning rates of Adam."""
 PIECES: Final = {"walk": 8, "hopper": 4}
 """Pieces of a rollout."""
-WINDOWS: Final = {"walk": (2, 4, 8), "hopper": (1, 2, 4)}
+WINDOWS: Final = {"walk": (2, 4, 8), "hopper": (4,)}
 """Pieces between cuts of the adjoint."""
+TITLES: Final = {"walk": "quadruped", "hopper": "hopper"}
 SEEDS: Final = 3
 """Descents of each pair of the grid."""
 LEARN_SEEDS: Final = 12
@@ -235,7 +236,7 @@ def executed(task: Task, thetas: Float[np.ndarray, "policies params"]) -> dict[s
 
 def grid(name: str, method: str) -> list[tuple[float, int]]:
     """Learning rates and windows to choose from, nine pairs for every method."""
-    if method == "zobg":
+    if method == "zobg" or len(WINDOWS[name]) == 1:
         return [(float(rate), PIECES[name]) for rate in np.geomspace(RATES[0] / 4, 4 * RATES[-1], 9)]
     return list(product(RATES, WINDOWS[name]))
 
@@ -270,10 +271,10 @@ def proximal(name: str, rate: float, seed: int) -> dict[str, Any]:
 
 
 def best(lines: list[dict[str, Any]], name: str, method: str) -> tuple[float, int]:
-    """The pair with the lowest mean final cost; with an onset term, that of the method without it."""
-    wanted = "tune", name, method.removesuffix("_onset")
-    (tuned,) = [line for line in lines if (line["what"], line["task"], line["method"]) == wanted]
-    return tuned["pairs"][int(np.argmin(np.mean(tuned["final"], axis=1)))]
+    """The pair with the lowest mean final cost; of a method with an onset term not tuned itself, that without it."""
+    tuned = {line["method"]: line for line in lines if (line["what"], line["task"]) == ("tune", name)}
+    found = tuned.get(method) or tuned[method.removesuffix("_onset")]
+    return found["pairs"][int(np.argmin(np.mean(found["final"], axis=1)))]
 
 
 HEADINGS: Final = (
@@ -287,35 +288,46 @@ HEADINGS: Final = (
     "distance [m]",
 )
 TICKS: Final = (0.15, 0.2, 0.3, 0.5, 1.0, 2.0)
+"""Of the quadruped's cost, which is positive."""
+HIGHEST: Final = 0.2
+"""Of the hopper's cost in the figure."""
 
 
-def figure(lines: list[dict[str, Any]], name: str) -> Figure:
-    """Mean cost with noise against rollouts and against seconds, with the range of the seeds' middle half."""
-    drawn = Figure(figsize=(9.0, 3.6), dpi=DPI, layout="constrained")
-    left, right = drawn.subplots(1, 2, sharey=True)
-    for method in [*METHODS, "ppo"]:
-        seeds = [each for each in lines if (each["task"], each["method"]) == (name, method) and each["what"] != "tune"]
-        seeds = [each for each in seeds if each.get("seed", 100) >= 100]
-        if not seeds:
-            continue
-        cost = np.concatenate([np.atleast_2d(each["cost"]) for each in seeds])
-        label, colour, _ = style_of({"zobg": "zobg_antithetic", "ivw_onset": "aobg_onset"}.get(method, method))
-        if method == "ppo":
-            label, colour = "PPO", INK
-        rollouts = np.arange(1, cost.shape[1] + 1) * SAMPLES * ITERATIONS / cost.shape[1]
-        times = np.mean([each["seconds"] for each in seeds], axis=0)
-        for axes, along in ((left, rollouts), (right, times)):
-            axes.plot(along, np.median(cost, axis=0), color=colour, label=label)
-            axes.fill_between(along, *np.quantile(cost, (0.25, 0.75), axis=0), color=colour, alpha=0.2, linewidth=0)
-    left.set(xlabel="rollouts", ylabel="cost of a batch", yscale="log", xticks=range(0, 20_001, 5_000))
-    left.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS], minor=False)
-    left.yaxis.set_minor_locator(NullLocator())
-    right.set(xlabel="seconds, with others beside on one GPU")
-    for axes in (left, right):
-        axes.grid(alpha=0.25, which="major")
-        axes.spines[["top", "right"]].set_visible(False)
-    left.legend(frameon=False, fontsize=8.5)
+def figure(lines: list[dict[str, Any]]) -> Figure:
+    """Mean cost with noise of both tasks against rollouts and seconds, with the range of the seeds' middle half."""
+    drawn = Figure(figsize=(9.0, 6.4), dpi=DPI, layout="constrained")
+    for (left, right), name in zip(drawn.subplots(2, 2, sharey="row"), ("hopper", "walk"), strict=True):
+        for method in [*METHODS, "ppo"]:
+            seeds = _new_seeds(lines, name, method)
+            if not seeds:
+                continue
+            cost = np.concatenate([np.atleast_2d(each["cost"]) for each in seeds])
+            label, colour, _ = style_of({"zobg": "zobg_antithetic", "ivw_onset": "aobg_onset"}.get(method, method))
+            label, colour = {"ppo": ("PPO", INK), "ivw_onset": ("IVW (onset)", colour)}.get(method, (label, colour))
+            rollouts = np.arange(1, cost.shape[1] + 1) * SAMPLES * ITERATIONS / cost.shape[1]
+            times = np.mean([each["seconds"] for each in seeds], axis=0)
+            for axes, along in ((left, rollouts), (right, times)):
+                axes.plot(along, np.median(cost, axis=0), color=colour, label=label)
+                axes.fill_between(along, *np.quantile(cost, (0.25, 0.75), axis=0), color=colour, alpha=0.2, linewidth=0)
+        left.set(xlabel="rollouts", ylabel=f"{TITLES[name]}: cost of a batch", xticks=range(0, 20_001, 5_000))
+        if name == "walk":
+            left.set_yscale("log")
+            left.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS], minor=False)
+            left.yaxis.set_minor_locator(NullLocator())
+        else:
+            left.set_ylim(top=HIGHEST)
+        right.set(xlabel="seconds, with the other seeds beside on one GPU", xscale="log")
+        for axes in (left, right):
+            axes.grid(alpha=0.25, which="major")
+            axes.spines[["top", "right"]].set_visible(False)
+        left.legend(frameon=False, fontsize=8.5)
     return drawn
+
+
+def _new_seeds(lines: list[dict[str, Any]], name: str, method: str) -> list[dict[str, Any]]:
+    """The lines of seeds that no learning rate was chosen by."""
+    found = [each for each in lines if (each["task"], each["method"]) == (name, method) and each["what"] != "tune"]
+    return [each for each in found if each.get("seed", 100) >= 100]
 
 
 def table(lines: list[dict[str, Any]], name: str) -> str:
@@ -323,9 +335,7 @@ def table(lines: list[dict[str, Any]], name: str) -> str:
     columns = ("final", "cost_trained", "distance_trained", "cost_longer", "distance_longer")
     rows = []
     for method in [*METHODS, "ppo"]:
-        seeds = [each for each in lines if (each["task"], each["method"]) == (name, method) and each["what"] != "tune"]
-        seeds = [each for each in seeds if each.get("seed", 100) >= 100]
-        if seeds:
+        if seeds := _new_seeds(lines, name, method):
             numbers = [np.concatenate([np.ravel(each[column]) for each in seeds]) for column in columns]
             window = f", {each} of {PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
             chosen = f"{seeds[0]['rate']:.2g}{window}"
@@ -341,11 +351,10 @@ def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:
 
 
 def report(path: str) -> None:
-    """Print a table for each task, and write the figure of the quadruped."""
+    """Write the tables of docs/robots.md and its figure."""
     lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
-    for name in dict.fromkeys(line["task"] for line in lines):
-        print(name, table(lines, name), sep="\n\n")
-    figure(lines, "walk").savefig(DOCS / "learning.png")
+    write_tables(DOCS / "robots.md", {name: table(lines, name) for name in TASKS})
+    figure(lines).savefig(DOCS / "learning.png")
 
 
 def main(what: str, name: str, method: str, *arguments: str) -> None:

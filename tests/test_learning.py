@@ -28,10 +28,12 @@ def test_windows_cut_the_adjoint_and_nothing_else(monkeypatch: pytest.MonkeyPatc
     assert np.max(np.abs(cut.gradient - uncut.gradient)) > 0.01 * np.max(np.abs(uncut.gradient))
 
 
-def test_the_page_has_the_table_of_the_data() -> None:
+def test_the_page_has_the_tables_of_the_data() -> None:
     lines = [json.loads(line) for line in (DATA / "learning.jsonl").read_text().splitlines()]
-    assert learning.table(lines, "walk") in (DOCS / "robots.md").read_text()
+    for name in learning.TASKS:
+        assert learning.table(lines, name) in (DOCS / "robots.md").read_text()
     assert learning.best(lines, "walk", "fobg_onset") == [0.005, 8.0]
+    assert learning.best(lines, "hopper", "fobg_onset")[0] > 2 * learning.best(lines, "hopper", "fobg")[0]
 
 
 def test_a_quadruped_stands_in_the_c_engine() -> None:
