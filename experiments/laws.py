@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from scipy import stats
 
 import mjx_study as study
 from estimators import NOISES, first_order, zeroth_order
@@ -58,6 +59,8 @@ SPEED, FRICTION, GRAVITY = 1.0, 1.0, 9.81  # [m/s], -, [m/s^2]
 SLOPE: Final = 0.5
 """Of the ground on which a ball of friction 1 rests."""
 STEPS: Final = (0.001, 0.002, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08)
+MEANS: Final = ("toss", "ball_wall", "slide", "corners", "box", "pusher", "tennis")
+KAPPAS: Final = ("toss, kappa 0.1", "toss", "toss, kappa 10")
 ZEROTH: Final = "MuJoCo's default, zeroth order"
 THROWN: Final = """<mujoco><option timestep="{}"/><worldbody><geom name="floor" type="plane" size="20 20 1" condim="3"/>
   <body pos="0 0 0.1"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>{}</body></worldbody>
@@ -65,7 +68,13 @@ THROWN: Final = """<mujoco><option timestep="{}"/><worldbody><geom name="floor" 
 GEOMS: Final = {
     "ball": '<geom name="thrown" size="0.1" mass="1" condim="3"/>',
     "box": '<joint axis="0 1 0"/><geom name="thrown" type="box" size="0.2 0.2 0.1" mass="1" condim="3"/>',
+    "corners": '<joint axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="0.0167 0.0167 0.0267"/>'
+    + "".join(
+        f'<geom name="{name}" size="0.001" pos="{x} {y} -0.099" condim="3"/>'
+        for name, x, y in (("thrown", 0.199, 0.199), ("b", -0.199, 0.199), ("c", 0.199, -0.199), ("d", -0.199, -0.199))
+    ),
 }
+"""The corners are spheres in place of the box's lower four."""
 
 
 def thrown(name: str, geom: str, horizon: int, start: Callable[[State, Any], State], at: float, sigma: float, cost):
@@ -91,7 +100,7 @@ def toss() -> Task:
     return thrown("toss", "ball", 80, start, GAP, SPREAD, lambda last: 100 * last.qpos[1] ** 2 + last.qpos.sum())
 
 
-def box() -> Task:
+def box(geom: str = "box") -> Task:
     """A box tilted by 0.2 rad falls onto an edge, then the other; the gap [m] is below the first."""
     lower = 0.2 * np.sin(0.2) + 0.1 * np.cos(0.2) - 0.1
     moving = jnp.array([SPEED / 2, -SPEED, 0.0])
@@ -99,7 +108,7 @@ def box() -> Task:
     def start(rest: State, gap: jax.Array) -> State:
         return State(jnp.stack([0.0, gap[0] + lower, 0.2]), moving, rest.act, rest.warmstart)
 
-    return thrown("box", "box", 80, start, GAP, SPREAD, lambda last: 100 * last.qpos[1] ** 2 + last.qpos.sum())
+    return thrown(geom, geom, 80, start, GAP, SPREAD, lambda last: 100 * last.qpos[1] ** 2 + last.qpos.sum())
 
 
 def slide() -> Task:
@@ -108,7 +117,10 @@ def slide() -> Task:
     return thrown("slide", "ball", 60, start, SPEED, 0.1 * SPEED, lambda last: last.qpos[0])
 
 
-SCENES: Final = {"toss": toss, "slide": slide, "box": box, "ball_wall": lambda: make_task("ball_wall")}
+SCENES: Final[dict[str, Callable[[], Task]]] = {
+    **{"toss": toss, "slide": slide, "box": box, "corners": partial(box, "corners")},
+    "ball_wall": partial(make_task, "ball_wall"),
+}
 SAMPLED: Final = ("pusher", "tennis")
 TRAINED: Final = {
     "pusher": {"iterations": 200, "samples": (10,)},
@@ -273,7 +285,7 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
             found["pusher", row] = partial(sampled, "pusher", *each)
     for row, scale in itertools.product(("log_barrier", "hunt_crossley"), (0.1, 10.0)):
         found[f"toss, kappa {scale:g}", row] = partial(integrated, "toss", row, "none", scale)
-    for scene, (row, each) in itertools.product(("slide", "tennis", "box"), LAWS.items()):
+    for scene, (row, each) in itertools.product(("slide", "tennis", "box", "corners"), LAWS.items()):
         found[scene, row] = partial(sampled if scene in SAMPLED else integrated, scene, *each)
     for row, scale in itertools.product(("kelvin_voigt", "conic"), (0.1, 10.0)):
         found[f"toss, kappa {scale:g}", row] = partial(integrated, "toss", row, "none", scale)
@@ -314,17 +326,22 @@ def tables() -> dict[str, str]:
         return "refused" if "refused" in numbers else say(numbers) if numbers else "-"
 
     def bias(of: dict[str, Any]) -> str:
-        error = (of["first_error"] + of["slope_error"]) / abs(of["slope"])
-        return f"{100 * (of['first'] / of['slope'] - 1):+.1f} ± {100 * error:.1g} %"
+        error = 100 * (of["first_error"] + of["slope_error"]) / abs(of["slope"])
+        shown = f"{100 * (of['first'] / of['slope'] - 1):.1f}".replace("-0.0", "0.0")
+        return f"{shown} %" if error < 0.05 else f"{shown} ± {float(f'{error:.1g}'):g} %"
 
     def deviation(of: dict[str, Any]) -> str:
         return f"{of['first_sd'] / of['zeroth_sd']:.2g}"
 
-    means = [
-        [row, *(cell(scene, row, say) for scene in ("toss", "ball_wall") for say in (bias, deviation))]
-        + [cell("toss", row, lambda of: f"{1e3 * of['seconds']:.2g}")]
-        for row in LAWS
-    ]
+    def share(row: str) -> str:
+        return cell("toss", row, lambda of: f"{1e3 * of['seconds']:.2g}")
+
+    def interval(costs: list[float], scale: float) -> str:
+        half = stats.t.ppf(0.975, len(costs) - 1) * np.std(costs, ddof=1) / len(costs) ** 0.5
+        return f"{scale * np.mean(costs):.4g} ± {scale * half:.1g}"
+
+    means = [[row, *(cell(scene, row, bias) for scene in MEANS), share(row)] for row in LAWS]
+    spreads = [[row, *(cell(scene, row, deviation) for scene in MEANS)] for row in LAWS]
     says: dict[str, Callable[[dict[str, Any]], str]] = {
         "depth at rest [mm]": lambda of: f"{1e3 * of['penetration']:.2g}",
         "creep [mm/s]": lambda of: "slides" if of["creep_gain"] > 0.1 else f"{1e3 * of['creep']:.2g}",
@@ -334,8 +351,28 @@ def tables() -> dict[str, str]:
     }
     plain = [row for row, (_, onset) in LAWS.items() if onset == "none"]
     fidelity = [[row, *(cell("faithful", row, say) for say in says.values())] for row in plain]
-    headers = ("law", "toss: bias", "sd / ZoBG's", "ball_wall: bias", "sd / ZoBG's", "ms per gradient")
-    rows = {"gradients": (headers, means), "fidelity": (("law", *says), fidelity)}
+    descents = [
+        [row]
+        + [
+            cell(f"train {name}", row, lambda of, key=key, scale=scale: interval(of[key], scale))
+            for name, scale in (("pusher", 1.0), ("ball_wall", 1e3))
+            for key in ("own", "engine")
+        ]
+        + [cell("train pusher", row, lambda of: f"{of['seconds']:.0f}")]
+        for row in (*LAWS, ZEROTH)
+    ]
+    kappas = [
+        [row, *(cell(scene, row, lambda of: f"{of['first_sd'] / of['zeroth_sd']:.3g}") for scene in KAPPAS)]
+        for row in OTHERS
+    ]
+    ways = "pusher: own", "in C", "ball_wall: own [1e-3]", "in C [1e-3]", "pusher [s]"
+    rows = {
+        "means": (("law", *MEANS, "ms per gradient"), means),
+        "deviations": (("law", *MEANS), spreads),
+        "fidelity": (("law", *says), fidelity),
+        "descents": (("law", *ways), descents),
+        "smoothing": (("law", "kappa / 10", "kappa", "10 kappa"), kappas),
+    }
     return {name: markdown_table(lines, header) for name, (header, lines) in rows.items()}
 
 

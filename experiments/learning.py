@@ -58,7 +58,7 @@ RATES: Final = (2e-3, 5e-3, 1e-2)
 """Learning rates of Adam."""
 PIECES: Final = {"walk": 8, "hopper": 4}
 """Pieces of a rollout."""
-WINDOWS: Final = {"walk": (2, 4, 8), "hopper": (4,)}
+WINDOWS: Final[dict[str, tuple[int, ...]]] = {"walk": (2, 4, 8), "hopper": (4,)}
 """Pieces between cuts of the adjoint."""
 TITLES: Final = {"walk": "quadruped", "hopper": "hopper"}
 SEEDS: Final = 3
