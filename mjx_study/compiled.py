@@ -93,6 +93,12 @@ class Compiled:
             return self._traced(arguments)
         return self._prepared(*self._form(arguments), arguments)
 
+    def within(self, *arguments: Any) -> Callable[..., Any]:
+        """The function for use within another program that JAX's default backend runs: its cached trace, which cannot
+        be batched or differentiated, or else `jitted`."""
+        ready = self._prepared(*self._form(arguments), arguments)
+        return self.jitted if isinstance(ready, jax.stages.Compiled) or ready is self._whole else ready
+
     def outputs(self, *arguments: Any, platform: str | None = None) -> Any:
         """Shapes and types of the outputs, without running the function; see `prepare` for the arguments."""
         ready = self.prepare(*arguments, platform=platform)

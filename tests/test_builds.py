@@ -81,7 +81,7 @@ def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
         large = [name for name in found["built"] if name in LARGE]
         descents_of_three_estimators = 2 * ("descent" in large)
         assert len(large) == len(set(large)) + descents_of_three_estimators, large
-    assert again["built"] == later["built"] == []
+    assert again["built"] == others["built"] == later["built"] == []
     assert first["traced"] and descents["traced"]
     for found in (again, others, line, later):
         assert not LARGE & {*found["built"]} and not found["traced"], found

@@ -21,7 +21,7 @@ from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.gradients import GradientComputation, block_of, blocks_of
 from mjx_study.experiment.merged_samples import REFERENCE_UNIT, Blocks
 from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.sampling import sample_keys
+from mjx_study.experiment.sampling import cell_keys, sample_keys
 from mjx_study.experiment.study import StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
@@ -248,3 +248,14 @@ def test_a_killed_command_goes_on_to_the_same_data(cluster: list[str], tmp_path:
     assert last.returncode == 0, last.stderr
     assert cli.main([*ARGUMENTS, "--output", str(tmp_path / "undisturbed")]) == 0
     assert same(load_study(folder), load_study(tmp_path / "undisturbed"))
+
+
+def test_keys_of_few_seeds_are_the_first_of_many() -> None:
+    few, many = (cell_keys(3, seeds) for seeds in (2, 40))
+    zeroth, first, *_, test = jax.random.split(jax.random.key(3), 5)
+    for found, all_of, stream in zip(
+        (*few["order"], few["tests"]), (*many["order"], many["tests"]), (zeroth, first, test), strict=True
+    ):
+        data = jax.random.key_data(jax.random.split(stream, 2))
+        np.testing.assert_array_equal(jax.random.key_data(found), data)
+        np.testing.assert_array_equal(np.asarray(jax.random.key_data(all_of))[:2], data)

@@ -44,17 +44,17 @@ def _numbers(found: Cells, scene: str) -> str:
             lines.append(
                 markdown_row(
                     engine.label,
-                    ", ".join(_slope(cell) for cell in row),
-                    ", ".join("-" if cell is None else f"{cell.get('mean', float('nan')):.3g}" for cell in row),
+                    ", ".join(_both(cell, "slope", "slope_by_differences") for cell in row),
+                    ", ".join(_both(cell, "mean", "mean_of_strata") for cell in row),
                     ", ".join("-" if cell is None else f"{cell.get('point_share', 0):.0%}" for cell in row),
                 )
             )
     return "\n".join(lines)
 
 
-def _slope(cell: Mapping[str, Any] | None) -> str:
-    """Both ways to the slope where they differ in what is printed."""
-    if cell is None or "slope" not in cell:
+def _both(cell: Mapping[str, Any] | None, *ways: str) -> str:
+    """Both ways to measure a number where they differ in what is printed."""
+    if cell is None or ways[0] not in cell:
         return "-"
-    one, other = (f"{cell[key]:.3g}" for key in ("slope", "slope_by_differences"))
-    return one if abs(cell["slope"] - cell["slope_by_differences"]) < 0.01 * abs(cell["slope"]) else f"{one} or {other}"
+    first, other = (cell[way] for way in ways)
+    return f"{first:.3g}" if abs(first - other) < 0.01 * abs(first) else f"{first:.3g} or {other:.3g}"

@@ -38,12 +38,12 @@ def module_name(mjcf: Path) -> str:
 def source_of_task(mjcf: Path, found: Proposal) -> str:
     """Python source of a module with a task, to be written beside the MJCF."""
     host, drive, name = found.scene.host, found.drive, function_name(mjcf)
-    place = f"{module_name(mjcf)}:{name}"
+    place, swept = f"{module_name(mjcf)}:{name}", found.load is not None and found.pair is not None
     lines = [
         f'"""A task for {_comment(mjcf.name)}, proposed by mjx-study init. Everything here is meant to be changed.',
         "",
         f"mjx-study rollout {place}     a film of what happens by itself",
-        f"mjx-study compare {place}     which gradient estimator, at which contact stiffness?",
+        f"mjx-study compare {place}     which gradient estimator{', at which contact stiffness' if swept else ''}?",
         f"mjx-study optimise {place}    reach the goal",
         '"""',
         "",
@@ -69,7 +69,9 @@ def source_of_task(mjcf: Path, found: Proposal) -> str:
         "        horizon=horizon,",
         "        policy=policy,",
         "        theta=theta,",
-        f"        sigma={drive.scale!r},  # standard deviation of the noise: {drive.meaning}",
+        f"        # The noise's standard deviation: {drive.meaning}. More spreads contact over more steps,",
+        "        # and smooths the cost that is optimised.",
+        f"        sigma={drive.scale!r},",
         "        start=start,",
         *([] if drive.at_start else ["        running_cost=running_cost,"]),
         "        final_cost=final_cost,",
@@ -172,14 +174,18 @@ def _costs(found: Proposal) -> Iterator[str]:
 
 def _contact(found: Proposal) -> Iterator[str]:
     """The swept contact, and defaults for studies."""
-    recipe = f"recipe=study.Recipe(learning_rate={found.learning_rate!r}, iterations={ITERATIONS}, samples={SAMPLES}),"
+    recipe = (
+        "# The learning rate is half of the best step down the slopes over held controls in MuJoCo's C engine;",
+        "# iterations and samples are a first try: watch whether the cost still falls at the end, and smoothly.",
+        f"recipe=study.Recipe(learning_rate={found.learning_rate!r}, iterations={ITERATIONS}, samples={SAMPLES}),",
+    )
     if found.load is None or found.pair is None:
         if found.touches:
             yield "        # To sweep a contact's stiffness, name its geoms in the MJCF and here, and remove families."
         yield "        contact_pair=None,"
         yield "        defaults=study.StudyDefaults("
         yield '            families=("mjcf",),  # contact as the MJCF has it'
-        yield f"            {recipe}"
+        yield from (f"            {line}" for line in recipe)
         yield "        ),"
         return
     low, high = found.stiffnesses[0], found.stiffnesses[-1]
@@ -190,7 +196,7 @@ def _contact(found: Proposal) -> Iterator[str]:
     yield f"            # [N/m] At {low:g} impact or weight sink in {depth} mm; the timestep resolves up to {high:g}."
     yield f"            stiffnesses={found.stiffnesses!r},"
     yield f"            damping={found.damping!r},  # [N s/m] in families without a damping ratio; friction needs some"
-    yield f"            {recipe}"
+    yield from (f"            {line}" for line in recipe)
     yield "        ),"
 
 

@@ -54,6 +54,8 @@ def run(options: argparse.Namespace) -> int:
         "learning_rate": found.learning_rate,
     }
     lines = [f"{target}: the task {place}; its comments say why its numbers are what they are"] if written else []
+    if written and not found.touches:
+        lines.append("nothing touched in its test rollouts, so there is no contact to study: move the start or the goal")
     if written:
         here = "" if mjcf.parent == Path() else f"cd {shlex.quote(str(mjcf.parent))} && "
         lines.append(f"next: {here}mjx-study compare {place}")

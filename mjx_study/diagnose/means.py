@@ -187,7 +187,7 @@ def _along_own(
 ) -> list[list[Circulation]]:
     """`along_means` with estimates from a batch of their own."""
     batches, _, _ = draw_batches(objective, theta, cell_keys(seed, 1), oracles_of(estimators), samples, slice(1))
-    estimates = unmixed(estimators, jax.tree.map(lambda leaf: leaf[0], batches))
+    estimates = unmixed(estimators, jax.tree.map(lambda leaf: jax.device_put(leaf[0]), batches))
     return along_means(estimators, objective, theta, reach, estimates, samples, seed)
 
 

@@ -183,16 +183,17 @@ def measure(
 
     progress(0, 3, "programs")
     builds = Builds()
+    blank = BlankObjective(**vars(objective))
     for oracle in oracles:
-        blank = BlankObjective(**vars(objective), builds=builds)
         getattr(blank, ORACLES[oracle].method)(task.theta, jax.random.split(jax.random.key(0), 1))
+    blank.build(builds)
     builds.wait()
     drawn(1)
     if samples is None:
         samples = affordable(sum(drawn(1)[1].values()), simulator.chunk_size)
     progress(1, 3, f"batches of {samples} samples")
     batches, seconds, residuals = drawn(samples)
-    batches = jax.tree.map(lambda leaf: leaf[0], batches)
+    batches = jax.tree.map(lambda leaf: jax.device_put(leaf[0]), batches)
     reach, first = reach_of(task), [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
     progress(2, 3, "means along paths")
     along = along_means(first, objective, task.theta, reach, unmixed(chosen, batches), samples, seed)

@@ -30,6 +30,7 @@ from mjx_study.experiment.memory import check_memory
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
+from mjx_study.graph.native import native_identity
 from mjx_study.objective import Simulator, TracedObjective, chunk_for, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.option import OptionError
@@ -188,6 +189,13 @@ class Backend:
         """Number of estimators to advance in parallel."""
         return 1 if self.simulator is None else len(self.simulator.devices)
 
+    @property
+    def _in_turn(self) -> bool:
+        """Whether an iteration takes seeds in turn, so that any number of them and of samples shares the traces of
+        rollouts: where these are native code, which gains nothing from larger batches."""
+        on_host = jax.default_backend() == "cpu" and native_identity() is not None
+        return on_host and self.task.scene.uses_graph
+
     def place(self, state: Descent, index: int) -> Descent:
         """Put the state of an estimator on its device; on CPUs always the first, see `spread`."""
         if self.simulator is None:
@@ -207,8 +215,10 @@ class Backend:
             if estimator not in self._iterations:
 
                 def simulated_update(contact, sigma, state: Descent, keys):
-                    objective = TracedObjective(simulator, contact, sigma)
+                    objective = TracedObjective(simulator, contact, sigma, batched=not self._in_turn)
                     batches = partial(draw, estimator.needs, objective, num_samples=self.samples)
+                    if self._in_turn:
+                        return update(state, jax.lax.map(lambda each: batches(*each), (state.theta, keys)))
                     return update(state, jax.vmap(batches)(state.theta, keys))
 
                 made_of = "descent", estimator, self.optimizer, self.task, self.samples, simulator.chunk_size

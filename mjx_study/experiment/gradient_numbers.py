@@ -48,7 +48,7 @@ def seed_numbers(chosen: tuple[Estimator, ...], confidence: float) -> Compiled:
     number of samples, reference and keys."""
 
     def numbers(batches, samples, reference, key):
-        estimates = [_estimate(estimator, batches, samples) for estimator in chosen]
+        estimates = [estimate_of(estimator, batches, samples) for estimator in chosen]
         found = estimate_numbers(estimates, reference, key, confidence)
         padding = len(batches["evaluation"].value) - samples
         return [row | {"nonfinite": row["nonfinite"] - padding} for row in found]
@@ -56,7 +56,7 @@ def seed_numbers(chosen: tuple[Estimator, ...], confidence: float) -> Compiled:
     return Compiled(jax.vmap(numbers, (0, None, None, 0)), "numbers of seeds", chosen, confidence)
 
 
-def _estimate(estimator: Estimator, batches: Batches, samples: Array) -> GradientEstimate:
+def estimate_of(estimator: Estimator, batches: Batches, samples: Any) -> GradientEstimate:
     """The estimate from the first samples of batches, the others being padding if the estimator is mergeable."""
     if not estimator.mergeable:
         return estimator(batches)
@@ -65,7 +65,7 @@ def _estimate(estimator: Estimator, batches: Batches, samples: Array) -> Gradien
     return estimator.join(*(estimators.summarise(jnp.where(real, part, jnp.nan)) for part in parts))
 
 
-def padded(leaf: Array, size: int) -> Array | np.ndarray:
+def padded(leaf: Any, size: int) -> Any:
     """Batches of several seeds with copies of their last sample, up to a size."""
     samples = leaf.shape[1]
     return leaf if samples == size else np.asarray(leaf)[:, np.minimum(np.arange(size), samples - 1)]

@@ -49,7 +49,14 @@ from mjx_study.experiment.reference_gradient import (
     reference_of,
     soft_gradient,
 )
-from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, sample_keys
+from mjx_study.experiment.sampling import (
+    Objectives,
+    cell_keys,
+    draw_batches,
+    rollouts_of,
+    rows_of_keys,
+    sample_keys,
+)
 from mjx_study.experiment.study import Computation, Result, StudyCell, StudyKind, StudyPlan, Work, done, estimators_of
 from mjx_study.experiment.tally import Tally
 from mjx_study.limits import MOST_GIB
@@ -235,14 +242,18 @@ class GradientComputation(Computation):
     def _merged(self, cell: StudyCell, blocks: Blocks) -> Arrays:
         """A cell's numbers from its blocks, all of which must be finished."""
         chosen, reference = estimators_of(self._plan, cell), estimators.summarise(jnp.asarray(blocks.reference))
-        tests, parts, tallies = jax.random.split(self._keys["test"], blocks.seeds), [], []
+        tests, parts, tallies = self._keys["tests"], [], []
         for seed in range(blocks.seeds):
             summary = blocks.whole(seed)
             estimates = []
             for index, estimator in enumerate(chosen):
                 found = [each for name, each in summary.items() if name.startswith(f"{index}.")]
                 estimates.append(estimator.join(*merged_estimates(tuple(found), cell.samples)))
-            parts.append(jax.device_get(estimate_numbers(estimates, reference, tests[seed], self._config.confidence)))
+            parts.append(
+                jax.device_get(
+                    estimate_numbers(estimates, reference, rows_of_keys(tests, seed), self._config.confidence)
+                )
+            )
             tallies.append({name: each for name, each in summary.items() if name in ORACLES})
         numbers = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
         found = cell_numbers(numbers, reference, chosen, tallies, cell.samples * blocks.seeds)
@@ -252,7 +263,7 @@ class GradientComputation(Computation):
         """A cell's numbers from whole batches."""
         config, oracles, keys = self._config, self._plan.oracles, self._keys
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
-        tests, chosen = jax.random.split(keys["test"], config.seeds), estimators_of(self._plan, cell)
+        tests, chosen = keys["tests"], estimators_of(self._plan, cell)
         together, each = seeds_together(self._plan, cell), self._seeds_of_statistics(cell)
         pad = partial(padded, size=self._plan.padded_samples(cell))
         reference: GradientEstimate | None = None
@@ -265,7 +276,10 @@ class GradientComputation(Computation):
                 some = slice(first, first + each)
                 with self._device:
                     numbers = seed_numbers(chosen, config.confidence)(
-                        jax.tree.map(lambda leaf, some=some: leaf[some], batches), samples, reference, keys[some]
+                        jax.tree.map(lambda leaf, some=some: leaf[some], batches),
+                        samples,
+                        reference,
+                        rows_of_keys(keys, some),
                     )
                     found.append(jax.device_get(numbers))
             numbers = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
@@ -288,7 +302,7 @@ class GradientComputation(Computation):
                     reference, pairs = self._reference(cell, objective, pilot)
             if parts:
                 parts[-1].result()  # keep at most two groups of seeds in memory
-            parts.append(self._in_order(partial(statistics, *drawn, tests[some])))
+            parts.append(self._in_order(partial(statistics, *drawn, rows_of_keys(tests, some))))
         return self._in_order(all_numbers)
 
     def _in_order(self, call: Callable[[], Result]) -> Future[Result]:
@@ -318,19 +332,23 @@ class GradientComputation(Computation):
     def _build(self, cell: StudyCell, objective: MjxObjective) -> None:
         """Build the programs of rollouts, and of the statistics of whole batches, side by side."""
         config, task = self._config, self._plan.task_of(cell)
-        blank = BlankObjective(**vars(objective), builds=self._builds)
-        key, seeds = jax.random.split(jax.random.key(0), 1), self._seeds_of_statistics(cell)
+        blank = BlankObjective(**vars(objective))
+        keys, seeds = self._keys["tests"], self._seeds_of_statistics(cell)
+        blank.evaluate(task.theta, rows_of_keys(keys, slice(1)))
+        blank.build(self._builds)  # the values' program, while the statistics are traced
         batches = {
-            name: getattr(blank, ORACLES[name].method)(task.theta, jax.random.clone(key)) for name in self._batches
+            name: getattr(blank, ORACLES[name].method)(task.theta, rows_of_keys(keys, slice(1)))
+            for name in self._batches
         }
         if blocks_of(self._plan, cell) == 1:
             size, drawn = self._plan.padded_samples(cell), {name: batches[name] for name in self._plan.oracles}
             drawn = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((seeds, size, *leaf.shape[1:]), leaf.dtype), drawn)
-            pilot = blank.evaluate(task.theta, jax.random.split(jax.random.key(0), min(cell.samples, PILOT)))
+            pilot = blank.evaluate(task.theta, rows_of_keys(keys, np.zeros(min(cell.samples, PILOT), int)))
             reference = reference_of(task, blank, *self._keys_of_reference(), pilot, None)
-            keys = jax.random.split(self._keys["test"], config.seeds)[:seeds]
+            keys = rows_of_keys(keys, slice(seeds))
             types = drawn, type_of(np.asarray(size)), jax.tree.map(type_of, reference), type_of(keys)
             self._builds.start(seed_numbers(estimators_of(self._plan, cell), config.confidence), *types)
+        blank.build(self._builds)
         self._builds.wait()
 
     def _reference(

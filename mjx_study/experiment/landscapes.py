@@ -20,10 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from estimators import Estimator
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
+from mjx_study.experiment.gradient_numbers import estimate_of, padded
+from mjx_study.experiment.memory import padded_size
 from mjx_study.experiment.quadrature import QUADRATURE, Line, Means, applies, closed_form, grid, means
 from mjx_study.experiment.resolution import line_of
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, unconverged
@@ -103,8 +105,11 @@ class LandscapeComputation(Computation):
         for theta in line.thetas(task.theta.dtype):
             drawn, _, residuals = draw_batches(objective, theta, keys, plan.oracles, cell.samples, slice(None))
             solved += residuals.values()
-            pooled = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[2:]), drawn)
-            columns.append(jax.device_get(_slopes(pooled, line.direction, chosen)))
+            pooled = jax.tree.map(lambda leaf: leaf.reshape(1, -1, *leaf.shape[2:]), drawn)
+            samples = config.seeds * cell.samples
+            size = padded_size(samples) if all(each.mergeable for each in chosen) else samples
+            pooled = jax.tree.map(lambda leaf, size=size: padded(leaf, size)[0], pooled)
+            columns.append(jax.device_get(_slopes(pooled, np.asarray(samples), line.direction, chosen)))
         arrays = {name: np.stack([column[name] for column in columns], axis=-1) for name in columns[0]}
         arrays |= {
             "position": line.position,
@@ -129,17 +134,20 @@ class LandscapeComputation(Computation):
 
 
 @partial(jax.jit, static_argnames="chosen")
-def _slopes(batches: dict[str, Any], direction: Array, chosen: tuple[Estimator, ...]):
-    """Costs at a point, and every estimator's slope along the line, without nonfinite samples."""
+def _slopes(
+    batches: dict[str, Any], samples: Int[Array, ""] | np.ndarray, direction: Array, chosen: tuple[Estimator, ...]
+) -> dict[str, Array]:
+    """Costs at a point, and every estimator's slope along the line, without nonfinite samples and padding."""
     evaluation = batches["evaluation"]
-    smoothed, smoothed_se = _mean(evaluation.value)
-    estimates = [estimator(batches) for estimator in chosen]
+    real, padding = jnp.arange(len(evaluation.value)) < samples, len(evaluation.value) - samples
+    smoothed, smoothed_se = _mean(jnp.where(real, evaluation.value, jnp.nan))
+    estimates = [estimate_of(estimator, batches, samples) for estimator in chosen]
     slope, slope_se = map(jnp.stack, zip(*(_mean(each.per_sample @ direction) for each in estimates), strict=True))
     return {
         "slope": slope,
         "slope_se": slope_se,
-        "nonfinite": jnp.stack([each.num_nonfinite for each in estimates]),
-        "cost": jnp.mean(evaluation.baseline),
+        "nonfinite": jnp.stack([each.num_nonfinite - padding for each in estimates]),
+        "cost": jnp.sum(jnp.where(real, evaluation.baseline, 0.0)) / samples,
         "smoothed": smoothed,
         "smoothed_se": smoothed_se,
     }

@@ -35,6 +35,11 @@ def padded_size(samples: int) -> int:
     return next((size for size in PADDED if size >= samples), samples)
 
 
+def padded_seeds(seeds: int) -> int:
+    """Smallest power of 16 that holds as many seeds: so many have keys."""
+    return next(size for size in (16**power for power in range(1, 9)) if size >= seeds)
+
+
 def batches_at_once(samples: int) -> int:
     """Number of batches of this many samples that are drawn at once."""
     return max(1, largest_batch() // samples)

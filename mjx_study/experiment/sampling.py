@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from estimators import ORACLES, Linearisation
-from mjx_study.experiment.memory import batches_at_once, padded_size
+from mjx_study.experiment.memory import PADDED, batches_at_once, padded_seeds, padded_size
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
@@ -40,10 +40,29 @@ class Objectives:
 
 
 def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
-    """Independent keys for each seed's batches, the reference and the tests; the same in every cell."""
+    """Independent keys for each seed's batches and tests, and for the reference; the same in every cell."""
+    of_seeds, (odd, candidate) = jax.device_get(_cell_keys(seed, padded_seeds(seeds)))
+    zeroth, first, tests = (_wrapped(data[:seeds]) for data in of_seeds)
+    reference = _wrapped(odd), _wrapped(candidate)
+    return {"order": [zeroth, first], "reference": reference, "tests": tests}
+
+
+@partial(jax.jit, static_argnums=1)
+def _cell_keys(seed: Int[Array, ""] | int, seeds: int) -> Any:
+    """Data of the keys; those of more seeds begin with those of fewer."""
     zeroth, first, odd, candidate, test = jax.random.split(jax.random.key(seed), 5)
-    by_order = [jax.random.split(stream, seeds) for stream in (zeroth, first)]
-    return {"order": by_order, "reference": (odd, candidate), "test": test}
+    of_seeds = [jax.random.key_data(jax.random.split(stream, seeds)) for stream in (zeroth, first, test)]
+    return of_seeds, [jax.random.key_data(key) for key in (odd, candidate)]
+
+
+def rows_of_keys(keys: Key[Array, "*rows"], rows: Any) -> Any:
+    """Some of an array of keys, indexed on the host, where no program is compiled for each size."""
+    return _wrapped(np.asarray(jax.random.key_data(keys))[rows])
+
+
+def _wrapped(data: Any) -> Any:
+    """Keys of data on the host."""
+    return jax.random.wrap_key_data(data)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -53,7 +72,15 @@ def sample_keys(key: Key[Array, ""], first: int | Int[Array, ""], count: int) ->
     return jax.vmap(lambda index: jax.random.fold_in(key, index))(indices)
 
 
-_keys_of_seeds = jax.jit(jax.vmap(sample_keys, (0, None, None)), static_argnums=2)
+def _keys_of_seeds(streams: Key[Array, " seeds"], first: int, count: int) -> Key[Array, " samples"]:
+    """Keys of consecutive samples of several seeds, one seed after the other, in a program for any small numbers."""
+    seeds, padded = len(streams), padded_size(count)
+    rows = np.minimum(np.arange(padded_seeds(seeds) if padded <= PADDED[-1] else seeds), seeds - 1)
+    data = np.asarray(jax.random.key_data(_sample_keys_of(rows_of_keys(streams, rows), first, padded)))
+    return _wrapped(data[:seeds, :count].reshape(-1, data.shape[-1]))
+
+
+_sample_keys_of = jax.jit(jax.vmap(sample_keys, (0, None, None)), static_argnums=2)
 
 
 def draw_batches(
@@ -74,23 +101,23 @@ def draw_batches(
         device: context held during each timed call.
 
     Returns:
-        By oracle: the batch, its computing time [s], and each rollout's solver residual.
+        By oracle: the batch, on CPUs as NumPy arrays; its computing time [s]; and each rollout's solver residual.
     """
-    together = batches_at_once(samples)
+    together, on_host = batches_at_once(samples), jax.default_backend() == "cpu"
     drawn, seconds, residuals = {}, {}, {}
     for name in oracles:
-        streams: Key[Array, " seeds"] = jax.random.clone(keys["order"][ORACLES[name].order])[seeds]
+        streams: Key[Array, " seeds"] = rows_of_keys(keys["order"][ORACLES[name].order], seeds)
         parts, seconds[name] = [], 0.0
         for start in range(0, len(streams), together):
-            some = jax.random.clone(streams)[start : start + together]
-            flat = _keys_of_seeds(some, first, padded_size(samples))[:, :samples].reshape(-1)
+            flat = _keys_of_seeds(rows_of_keys(streams, slice(start, start + together)), first, samples)
             with device:
                 begun = time.perf_counter()
                 batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
                 seconds[name] += time.perf_counter() - begun
             residuals[name] = np.concatenate([residuals.get(name, np.zeros(0)), residuals_of(batch)])
+            batch = jax.device_get(batch) if on_host else batch
             parts.append(jax.tree.map(lambda leaf: leaf.reshape(len(leaf) // samples, samples, *leaf.shape[1:]), batch))
-        drawn[name] = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+        drawn[name] = jax.tree.map(lambda *leaves: (np if on_host else jnp).concatenate(leaves), *parts)
     return drawn, seconds, residuals
 
 

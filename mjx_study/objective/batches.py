@@ -19,6 +19,7 @@ from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.onset import OnsetCounts
 from mjx_study.tasks.task import Task
 
 Theta = Float[Array, " params"]
@@ -98,7 +99,15 @@ class Simulator:
         )
 
     def form(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any) -> Any:
-        """Shapes and types of a chunk's outputs of one of `SamplePrograms`, without running it."""
+        """Shapes and types of a chunk's outputs of one of `SamplePrograms`, without running it.
+
+        Those of gradients follow from those of values: what takes both can be compiled before gradients are traced.
+        """
+        if name in ("gradient", "corrected"):
+            value, score, residual = self.form("value", theta, contact_for("value", contact), sigma)
+            corrected = name == "corrected" or self.task.onset != "none"
+            shape = self.chunk_size, len(dataclasses.fields(OnsetCounts))
+            return value, score, residual, jax.ShapeDtypeStruct(shape, float) if corrected else None
         arguments = self._chunk(theta, contact, sigma)
         return self._programs[name].outputs(*arguments, platform=self.devices[0].platform)
 
@@ -158,8 +167,10 @@ class MjxObjective:
         values, scores, residuals = self._run("value", theta, keys, rows, scale)
         with np.errstate(all="ignore"):  # lost samples are counted with the estimates
             odd = (values[:samples] - values[samples:]) / 2
-        residual = jnp.maximum(residuals[:samples], residuals[samples:])
-        return Evaluation(*map(jnp.asarray, (odd, scores[:samples], jnp.zeros_like(odd), residual)))
+            residual = (np if isinstance(residuals, np.ndarray) else jnp).maximum(
+                residuals[:samples], residuals[samples:]
+            )
+        return Evaluation(*map(_placed, (odd, scores[:samples], np.zeros(samples, odd.dtype), residual)))
 
     def evaluate_pair(self, theta: Theta, keys: Keys) -> tuple[Evaluation, Evaluation]:
         """Evaluate pairs of samples with opposite noise, the same initial states and a shared baseline."""
@@ -168,7 +179,7 @@ class MjxObjective:
 
     def differentiate(self, theta: Theta, keys: Keys) -> Differentiation:
         """Return each sample's cost and its exact gradient with respect to theta."""
-        return Differentiation(*jax.tree.map(jnp.asarray, self._run("gradient", theta, keys)))
+        return Differentiation(*jax.tree.map(_placed, self._run("gradient", theta, keys)))
 
     def evaluate_steps(self, theta: Theta, keys: Keys) -> StepEvaluation:
         (steps,) = self._evaluate_steps(theta, keys, (1.0,))
@@ -180,11 +191,11 @@ class MjxObjective:
 
     def differentiate_corrected(self, theta: Theta, keys: Keys) -> Differentiation:
         """`differentiate` with the task's onset term, or the linear one if the task has none."""
-        return Differentiation(*jax.tree.map(jnp.asarray, self._run("corrected", theta, keys)))
+        return Differentiation(*jax.tree.map(_placed, self._run("corrected", theta, keys)))
 
     def differentiate_steps(self, theta: Theta, keys: Keys) -> StepDifferentiation:
         """Roll out as `differentiate`, with the derivative of each sample's cost with respect to its noise."""
-        return StepDifferentiation(*jax.tree.map(jnp.asarray, self._run("step_gradient", theta, keys)))
+        return StepDifferentiation(*jax.tree.map(_placed, self._run("step_gradient", theta, keys)))
 
     def linearise(self, theta: Theta, keys: Keys) -> Linearisation:
         """Roll out as `differentiate`, with the derivatives of every step.
@@ -193,8 +204,8 @@ class MjxObjective:
         """
         (to_go, scores, jacobian), residual, derivatives = self._run("linearisation", theta, keys)
         zero_noise = self._zero_noise_to_go(theta, keys)
-        steps = StepEvaluation(*jax.tree.map(jnp.asarray, (to_go, zero_noise, scores, jacobian, residual)))
-        return Linearisation(steps, *jax.tree.map(jnp.asarray, derivatives))
+        steps = StepEvaluation(*jax.tree.map(_placed, (to_go, zero_noise, scores, jacobian, residual)))
+        return Linearisation(steps, *jax.tree.map(_placed, derivatives))
 
     def _evaluate(self, theta, keys, signs: tuple[float, ...]) -> list[Evaluation]:
         samples, zero_noise = len(keys), self._zero_noise_rows(len(keys))
@@ -203,7 +214,7 @@ class MjxObjective:
         values, scores, residuals = self._run("value", theta, keys, rows, scale)
         baseline = _for_all(values[len(signs) * samples :], samples)
         return [
-            Evaluation(value, score, jnp.asarray(baseline), residual)
+            Evaluation(value, score, _placed(baseline), residual)
             for value, score, residual in _in_turn((values, scores, residuals), samples, len(signs))
         ]
 
@@ -211,7 +222,7 @@ class MjxObjective:
         samples = len(keys)
         rows, scale = np.tile(np.arange(samples), len(signs)), np.repeat(signs, samples)
         (to_go, scores, jacobian), residual = self._run("steps", theta, keys, rows, scale)
-        zero_noise = jnp.asarray(self._zero_noise_to_go(theta, keys))
+        zero_noise = _placed(self._zero_noise_to_go(theta, keys))
         return [
             StepEvaluation(part[0], zero_noise, *part[1:])
             for part in _in_turn((to_go, scores, jacobian, residual), samples, len(signs))
@@ -240,13 +251,21 @@ class MjxObjective:
 
 @dataclasses.dataclass(frozen=True)
 class BlankObjective(MjxObjective):
-    """An objective whose batches hold zeros: their shapes, from programs that are traced, and compiled in the
-    background."""
+    """An objective whose batches hold zeros: their shapes, without compiling the programs that they need.
 
-    builds: Builds
+    Attributes:
+        programs: names in `SamplePrograms` of those needed so far.
+    """
+
+    programs: dict[str, None] = dataclasses.field(default_factory=dict)
+
+    def build(self, builds: Builds) -> None:
+        """Begin to compile `programs`, those begun before excepted."""
+        for name in self.programs:
+            self.simulator.build(name, self.simulator.task.theta, self.contact, self.sigma, builds)
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
-        self.simulator.build(name, theta, self.contact, self.sigma, self.builds)
+        self.programs[name] = None
         rows = np.arange(len(keys)) if rows is None else rows
         made = self.simulator.form(name, theta, contact_for(name, self.contact), self.sigma)
         return jax.tree.map(lambda leaf: np.zeros((len(rows), *leaf.shape[1:]), leaf.dtype), made)
@@ -255,7 +274,13 @@ class BlankObjective(MjxObjective):
 @dataclasses.dataclass(frozen=True)
 class TracedObjective(MjxObjective):
     """An objective inside a larger compiled program on one device, without returning to the host between batch and
-    estimate."""
+    estimate.
+
+    Attributes:
+        batched: whether the program batches the objective, whose programs are then traced anew in it.
+    """
+
+    batched: bool = True
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
         simulator = self.simulator
@@ -264,8 +289,10 @@ class TracedObjective(MjxObjective):
         scale = np.ones(len(rows), dtype) if noise_scale is None else np.asarray(noise_scale, dtype)
         chunk = simulator.chunk_size
         chunks = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1).reshape(-1, chunk)
-        program, key_data = simulator._programs[name].jitted, jax.random.key_data(keys)
-        sigma = jnp.asarray(self.sigma, dtype)
+        key_data, sigma = jax.random.key_data(keys), jnp.asarray(self.sigma, dtype)
+        kept = simulator._programs[name]
+        types = theta, self.contact, sigma, *simulator._chunk(theta, None, 1.0)[-2:]
+        program = kept.jitted if self.batched else kept.within(*types)
 
         def call(chunk):
             drawn, factor = chunk
@@ -281,7 +308,12 @@ class TracedObjective(MjxObjective):
 def _in_turn(outputs: tuple[Any, ...], samples: int, count: int) -> list[tuple[Any, ...]]:
     """Split concatenated outputs into batches of one size; any further rows are dropped."""
     starts = range(0, count * samples, samples)
-    return [jax.tree.map(lambda leaf, at=at: jnp.asarray(leaf[at : at + samples]), outputs) for at in starts]
+    return [jax.tree.map(lambda leaf, at=at: _placed(leaf[at : at + samples]), outputs) for at in starts]
+
+
+def _placed(leaf: Any) -> Any:
+    """An array of JAX's, without a program for its shape."""
+    return jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf
 
 
 def _for_all(rows, samples: int):

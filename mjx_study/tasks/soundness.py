@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import HostState, engine_model, host_data, quiet_engine
@@ -48,7 +48,7 @@ def check_soundness(task: Task) -> None:
         )
 
 
-def _rollout(task: Task) -> tuple[State, Float[Array, "steps nu"]]:
+def _rollout(task: Task) -> tuple[State, Float[np.ndarray, "steps nu"]]:
     """Finite states of a rollout without noise, the initial one included, and the controls between them."""
     dtype = task.scene.template.qpos.dtype
     noise = jnp.zeros(task.policy.noise_shape, dtype)
@@ -59,18 +59,18 @@ def _rollout(task: Task) -> tuple[State, Float[Array, "steps nu"]]:
     host.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     qpos, qvel, act, warmstart = (np.asarray(leaf, float) for leaf in jax.tree.leaves(state))
     data = host_data(host, HostState(qpos, qvel, act, np.zeros(host.nu), warmstart))
-    states, controls = [state], []
+    leaves, form = jax.tree.flatten(state)
+    states, controls = [[np.asarray(leaf) for leaf in leaves]], []
     with quiet_engine():
         for control in feedforward:
-            added = feedback(states[-1])
+            added = feedback(form.unflatten(states[-1]))
             control = control if added is None else control + np.asarray(added, float)
             data.ctrl[:] = control
             mujoco.mj_step(host, data)
             found = data.qpos, data.qvel, data.act, data.qacc_warmstart
             if not all(np.all(np.isfinite(leaf)) for leaf in (*found, control)):
                 break
-            qpos, qvel, act, warmstart = (jnp.array(leaf, dtype) for leaf in found)  # copies
-            states.append(State(qpos, qvel, act, warmstart))
+            states.append([np.array(leaf, dtype) for leaf in found])  # copies
             controls.append(control)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    return stacked, jnp.asarray(controls, dtype).reshape(len(controls), host.nu)
+    stacked = form.unflatten([np.stack(column) for column in zip(*states, strict=True)])
+    return stacked, np.asarray(controls, dtype).reshape(len(controls), host.nu)
