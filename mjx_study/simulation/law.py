@@ -38,8 +38,9 @@ from mjx_study.simulation.scene import Scene
 INSTALL: Final = "needs MuJoDiCo: pip install 'mjx-study[laws]'"
 STIFFNESS_SCALE: Final = 100.0
 """MuJoDiCo's stiffness [N/m] over MuJoCo's k / d_width^2 [1/s^2]."""
-BUDGET: Final = {"tolerance": 1e-12, "iterations": 50, "ls_tolerance": 1e-12, "ls_iterations": 50}
-"""Of MuJoDiCo's solvers, whose derivative is only as good as their solution [m/s for the first]."""
+BUDGET: Final = {"tolerance": 1e-13, "iterations": 50, "ls_tolerance": 1e-28, "ls_iterations": 8}
+"""Of MuJoDiCo's solvers, whose derivative is only as good as their solution. With its line search run to 1e-12 J, as
+the steps get small none of them is whole, and the last of 1e-12 m/s leaves as much."""
 CONE_FLOOR: Final = 1e-14
 """In place of MuJoDiCo's 1e-8, in float64, with which the derivative of `conic` is off by 2e-3."""
 FLOOR: Final = 1e-8
