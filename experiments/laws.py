@@ -7,6 +7,7 @@ All at MuJoCo's default stiffness: K is that of solref (0.02, 1) for the contact
 acts on one number, and means are quadrature; in `SAMPLED` they are means over samples, along a direction of theta.
 """
 
+import dataclasses
 import itertools
 import json
 import sys
@@ -25,9 +26,10 @@ import mjx_study as study
 from estimators import NOISES, first_order, zeroth_order
 from experiments import DATA, DOCS
 from experiments.pages import write_tables
-from mjx_study.choices import DEFAULT_SOLREF, FAMILIES
+from mjx_study.choices import DEFAULT_SOLREF, FAMILIES, TASK_DESCRIPTIONS
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.quadrature import Line, grid, means
+from mjx_study.gradcheck import gradcheck, plan_gradcheck
 from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.runtime import configure
@@ -46,7 +48,7 @@ from mjx_study.table import markdown_table
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
-CELLS: Final = DATA / "laws.jsonl"
+CELLS, CHECKS = DATA / "laws.jsonl", DATA / "laws_checks.jsonl"
 LAWS: Final = {
     "MuJoCo's default": ("mujoco_default", "none"),
     "with the onset term": ("mujoco_default", "linear"),
@@ -127,6 +129,17 @@ TRAINED: Final = {
     "ball_wall": {"iterations": 40, "samples": (30,), "learning_rate": 1.0},
 }
 SEEDS, DRAWS = 3, 1000
+CORNER: Final[dict[str, dict[str, float]]] = {
+    "the task": {},
+    **{f"friction {each:g}": {"friction": each} for each in (2.0, 1.0, 0.5)},
+    **{f"steps of {1e3 * each:g} ms": {"timestep": each} for each in (1e-3, 5e-4)},
+    **{f"kappa x {each:g}": {"scale": each} for each in (0.1, 10.0)},
+}
+"""Changes of `ball_wall` and of Kelvin-Voigt on it."""
+DURATION, NARROW = 0.8, 1e-6  # [s], [rad]
+PYRAMIDAL: Final = {*itertools.product(("sliding_box", "ball_wall", "gripper", "landing"), ("log_barrier", "conic"))}
+"""Tasks and laws that need pyramidal cones."""
+CHECKED: Final = tuple(name for name in TASK_DESCRIPTIONS if not name.endswith((":dome", ":published")))
 
 
 def member(task: Task, family: str, scale: float = 1.0) -> ContactModel:
@@ -272,6 +285,44 @@ def executed(task: Task, theta: Any) -> float:
     return float(jax.jit(jax.vmap(cost))(qpos, qvel, controls).mean())
 
 
+def checked(name: str, family: str, cone: str) -> dict[str, Any]:
+    """Verdict and largest errors of `gradcheck` under a law, at the task's middle stiffness."""
+    task = make_task(name, **({"cone": cone} if cone else {}))
+    stiffnesses = task.defaults.stiffnesses
+    swept = (float(stiffnesses[len(stiffnesses) // 2]),) if FAMILIES[family].swept else None
+    report = gradcheck(plan_gradcheck(task, (family,), swept, seed=0))
+    (of_cost,), (of_step,) = report.costs, report.steps
+    return {
+        "verdicts": [of_cost.verdict, of_step.verdict],
+        "failing": [each.line() for each in report.findings if each.fails],
+        "stiffness": of_cost.stiffness,
+        "of_cost": of_cost.difference,
+        "of_step": of_step.differences,
+        "of_parameters": of_step.parameters,
+        "exercised": of_step.coverage.line(),
+    }
+
+
+def corner(friction: float | None = None, timestep: float = 0.002, scale: float = 1.0) -> dict[str, Any]:
+    """Where Kelvin-Voigt's cost on `ball_wall` is steepest: the share of its mean's slope between three points of the
+    grid there, and the share of this change of the cost that lies in `NARROW`."""
+    task = make_task("ball_wall", timestep=timestep, horizon=round(DURATION / timestep))
+    contact, position, costs = member(task, "kelvin_voigt", scale), np.asarray(task.theta, float), Line(task)
+    if friction is not None:
+        contact = dataclasses.replace(contact, friction=jnp.array([friction, *task.scene.host.geom_friction[0, 1:]]))
+    points = grid(position[0], position[0], task.sigma, MANY, task.noise)
+    values, slopes = costs(points, contact)
+    slope = means(points, values, slopes, position, task.sigma, task.noise).slope[0]
+    density = NOISES[task.noise].density((points - position[0]) / task.sigma) / task.sigma
+    shares = density[1:-1] * (values[2:] - values[:-2]) / slope
+    worst = 1 + int(np.argmax(np.abs(np.diff(values, 2)) * density[1:-1]))
+    inside = np.linspace(points[worst - 1], points[worst + 1], MANY + 1)
+    fine = costs(inside, contact)[0]
+    across = round(NARROW / (inside[1] - inside[0]))
+    narrow = np.abs(fine[across:] - fine[:-across]).max() / abs(fine[-1] - fine[0])
+    return {"share": shares[worst - 1], "narrow": narrow, "at": points[worst], "slope": slope}
+
+
 def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
     """What is measured, by scene and row."""
     found: dict[tuple[str, str], Callable[[], dict[str, Any]]] = {}
@@ -289,12 +340,16 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
         found[scene, row] = partial(sampled if scene in SAMPLED else integrated, scene, *each)
     for row, scale in itertools.product(("kelvin_voigt", "conic"), (0.1, 10.0)):
         found[f"toss, kappa {scale:g}", row] = partial(integrated, "toss", row, "none", scale)
+    found |= {("corner", row): partial(corner, **changes) for row, changes in CORNER.items()}
+    for name, law, cone in itertools.product(CHECKED, OTHERS, ("", "pyramidal")):
+        if not cone or (name, law) in PYRAMIDAL:
+            found[f"gradcheck {name}{' ' * bool(cone)}{cone}", law] = partial(checked, name, law, cone)
     return found
 
 
 def measured() -> dict[tuple[str, str], dict[str, Any]]:
-    """The numbers of data/laws.jsonl by scene and row."""
-    lines = CELLS.read_text().splitlines() if CELLS.exists() else []
+    """The numbers of both files by scene and row."""
+    lines = [line for path in (CELLS, CHECKS) if path.exists() for line in path.read_text().splitlines()]
     return {(each.pop("scene"), each.pop("row")): each for each in map(json.loads, lines)}
 
 
@@ -302,7 +357,7 @@ def measure(only: list[str]) -> None:
     """Append what is missing, of the scenes named or all."""
     known = measured()
     for (scene, row), compute in cells().items():
-        if (scene, row) in known or (only and scene not in only):
+        if (scene, row) in known or (only and not {scene, scene.partition(" ")[0]} & set(only)):
             continue
         begin = time.perf_counter()
         try:
@@ -310,9 +365,10 @@ def measure(only: list[str]) -> None:
         except ValueError as error:
             numbers = {"refused": str(error)}
         numbers = {
-            name: float(each) if np.ndim(each) == 0 and name != "refused" else each for name, each in numbers.items()
+            name: float(each) if np.ndim(each) == 0 and not isinstance(each, str | None) else each
+            for name, each in numbers.items()
         }
-        with CELLS.open("a") as file:
+        with (CHECKS if scene.startswith(("gradcheck", "corner")) else CELLS).open("a") as file:
             file.write(json.dumps({"scene": scene, "row": row, **numbers}) + "\n")
         print(f"{scene}, {row}: {time.perf_counter() - begin:.0f} s", flush=True)
 
@@ -365,6 +421,23 @@ def tables() -> dict[str, str]:
         [row, *(cell(scene, row, lambda of: f"{of['first_sd'] / of['zeroth_sd']:.3g}") for scene in KAPPAS)]
         for row in OTHERS
     ]
+
+    def verdict(of: dict[str, Any]) -> str:
+        errors = (of[name] for name in ("of_cost", "of_step", "of_parameters") if of[name] is not None)
+        kinds = {kind: f", {kind}s" for kind in ("kink", "jump") if kind in of["verdicts"]}
+        return "wrong" if of["failing"] else f"right{''.join(kinds.values())} ({max(errors):.0e})"
+
+    def of_task(name: str, law: str) -> str:
+        turned = f"gradcheck {name} pyramidal"
+        marked = lambda of: f"{verdict(of)} *"  # noqa: E731
+        return cell(turned, law, marked) if (name, law) in PYRAMIDAL else cell(f"gradcheck {name}", law, verdict)
+
+    checks = [[f"`{name}`", *(of_task(name, law) for law in OTHERS)] for name in CHECKED]
+    shares: dict[str, Callable[[dict[str, Any]], str]] = {
+        "share of the slope": lambda of: f"{100 * of['share']:.1f} %",
+        "of it in 1e-6 rad": lambda of: f"{100 * of['narrow']:.2g} %",
+    }
+    corners = [[row, *(cell("corner", row, say) for say in shares.values())] for row in CORNER]
     ways = "pusher: own", "in C", "ball_wall: own [1e-3]", "in C [1e-3]", "pusher [s]"
     rows = {
         "means": (("law", *MEANS, "ms per gradient"), means),
@@ -373,6 +446,7 @@ def tables() -> dict[str, str]:
         "descents": (("law", *ways), descents),
         "smoothing": (("law", "kappa / 10", "kappa", "10 kappa"), kappas),
     }
+    rows |= {"gradcheck": (("task", *OTHERS), checks), "corner": (("`ball_wall`", *shares), corners)}
     return {name: markdown_table(lines, header) for name, (header, lines) in rows.items()}
 
 

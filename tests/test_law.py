@@ -1,6 +1,7 @@
 """Contact laws beyond MuJoCo's: static load, derivatives, what commands leave out for them, refusals."""
 
 import builtins
+import dataclasses
 import json
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,10 @@ import mjx_study as study
 from mjx_study import cli
 from mjx_study.bench import plan_bench, run_bench
 from mjx_study.choices import laws_of
+from mjx_study.execution.run import run_study
 from mjx_study.objective import rollout_cost
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.simulation import dynamics
 from mjx_study.simulation.contact import apply_contact, cone_edges, effective_mass, family_model
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.law import LAWS
@@ -103,6 +107,37 @@ def test_gradcheck_counts_what_has_no_counterpart(capsys: pytest.CaptureFixture[
     assert own["verdict"] == "right" and own["differences"] < 1e-6 and own["coverage"]["counts"]["push"]
     (said,) = [warning for warning in document["warnings"] if "not compared" in warning]
     assert said.startswith("hunt_crossley, K = 1000 N/m: 3 states not compared with mjx.step and the C engine")
+
+
+def test_a_sweep_over_laws_resumes_to_the_same_numbers(tmp_path: Path) -> None:
+    """Of MuJoCo's law and another's, in two programs each, the other's the one that differentiates as a graph."""
+    families: dict[str, Any] = {"contact": ("mujoco", "kelvin_voigt"), "stiffness": (100.0, 1000.0), "samples": (4,)}
+    about = StudyConfig(tasks=("pusher",), horizon=20, reference_samples=6, seeds=2, **families)
+    whole = run_study(about, tmp_path)
+    assert whole.attrs["computed_cells"] == 4 and np.all(whole["unconverged"] == 0)
+    assert np.all(whole["gradient_norm"] > 0) and not np.any(whole["nonfinite"])
+    for cell in sorted(tmp_path.glob("cells/*.npz"))[1:3]:
+        cell.unlink()
+    again = run_study(about, tmp_path)
+    assert again.attrs["computed_cells"] == 2
+    for name in ("variance", "gradient_norm", "relative_error", "residual"):
+        np.testing.assert_array_equal(again[name], whole[name])
+
+
+@pytest.mark.parametrize("law", ["kelvin_voigt", "conic"])
+def test_the_graph_has_the_packages_own_derivative(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, graphs = ball(), []
+    advance = stepping(scene, law, 2000.0 if study.FAMILIES[law].swept else None)
+    qpos, qvel = scene.template.qpos.at[2].set(0.099), jnp.array([0.3, 0.1, -0.2, 0.4, -0.3, 0.2])
+    start = study.initial_state(scene, qpos, qvel)
+    make = dynamics.by_graph
+    monkeypatch.setattr(dynamics, "by_graph", lambda *given: graphs.append(make(*given)) or graphs[-1])
+    slope = lambda: jax.jit(jax.jacfwd(lambda qvel: advance(state=dataclasses.replace(start, qvel=qvel))[0].qvel))  # noqa: E731
+    graph = slope()(qvel)
+    assert len(graphs) == 1 and graphs[0] is not None
+    monkeypatch.setattr(type(advance.args[1].law), "equations", lambda *_: None)
+    np.testing.assert_allclose(graph, slope()(qvel), atol=1e-7)
+    assert len(graphs) == 1
 
 
 @pytest.mark.slow

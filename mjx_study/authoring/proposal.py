@@ -154,7 +154,7 @@ def _drive(host: mujoco.MjModel) -> Drive:
     holding = np.where(motor & (gain > 0), force / np.maximum(gain, mujoco.mjMINVAL), 0.0)
     strongest = LIFTING * float(holding.max())
     scales = np.where(limited, (high - low) / 2, np.where(motor & (strongest > 0.01), strongest, 1.0))
-    meaning = "a fifth of the control that balances gravity" if strongest > 0.01 else "a tenth of the unit of the controls"
+    meaning = "a fifth of the control that balances gravity" if strongest > 0.01 else "a tenth of the controls' unit"
     meaning = f"{NOISE:g} of half a control's range" if limited.all() else meaning
     return Drive(host, neutral, rounded(NOISE * float(np.median(scales)), 1), meaning)
 

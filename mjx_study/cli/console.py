@@ -139,8 +139,8 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
         lines += [
             f"Errors are against an unbiased zeroth-order reference gradient, {_range(pairs, '{:,.0f}'.format)} pairs "
             "of rollouts with a control variate;",
-            f"its own relative uncertainty is {_range(uncertainty, partial(number, digits=2))}: errors of that size are "
-            "expected without any bias.",
+            f"its own relative uncertainty is {_range(uncertainty, partial(number, digits=2))}: errors of that size "
+            "are expected without any bias.",
             MARKS,
         ]
     lines.append("ms: computing time of one sample; variance x s: the variance times it, in seconds.")

@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
     }
     lines = [f"{target}: the task {place}; its comments say why its numbers are what they are"] if written else []
     if written and not found.touches:
-        lines.append("nothing touched in its test rollouts, so there is no contact to study: move the start or the goal")
+        lines.append("nothing touched in its test rollouts: there is no contact to study unless start or goal move")
     if written:
         here = "" if mjcf.parent == Path() else f"cd {shlex.quote(str(mjcf.parent))} && "
         lines.append(f"next: {here}mjx-study compare {place}")

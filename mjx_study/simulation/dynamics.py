@@ -136,8 +136,25 @@ def exact_step(scene: Scene, model: mjx.Model, state: State, control: Control) -
 
 def _step_of_law(scene: Scene, model: LawModel, state: State, control: Control) -> tuple[State, Qvel, Scalar]:
     """`step` under another law than MuJoCo's, and the acceleration in it, with its derivative."""
-    advance = jax.checkpoint(lambda model, *point: model.law.step(scene, model, *point))
-    qpos, qvel, act, qacc, residual = advance(model, state.qpos, state.qvel, state.act, control)
+    traced_model, whole = traced_part(model)
+    values, equations = partial(model.law.step, scene), model.law.equations(scene)
+
+    def stepped(traced: Any, *point: Any) -> Any:
+        return entry_by_entry(values, whole(traced), *point)
+
+    def rule(primals: Any, changes: Any) -> Any:
+        after, (traced, *point), (of_model, *moved) = advance(*primals), primals, changes
+        through = lambda _, traced, *point: values(whole(traced), *point)[:4]  # noqa: E731
+        change = None
+        if equations is not None and not jax.tree.leaves(of_model):
+            whole_change = instantiated(tuple(point), tuple(moved))
+            at_model = lambda qacc, *point: through(qacc, traced, *point)  # noqa: E731
+            change = by_graph(equations, at_model, whole(traced), point, after[3], whole_change)
+        change = change or by_tape(through, after[3], (traced, *point), (of_model, *moved))
+        return after, (*change, jnp.zeros_like(after[4]))
+
+    advance = with_rule(stepped, rule)
+    qpos, qvel, act, qacc, residual = advance(traced_model, state.qpos, state.qvel, state.act, control)
     return State(qpos, qvel, act, qacc), qacc, residual
 
 

@@ -23,6 +23,7 @@ import dataclasses
 import functools
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 import jax
@@ -37,14 +38,21 @@ from mjx_study.simulation.scene import Scene
 INSTALL: Final = "needs MuJoDiCo: pip install 'mjx-study[laws]'"
 STIFFNESS_SCALE: Final = 100.0
 """MuJoDiCo's stiffness [N/m] over MuJoCo's k / d_width^2 [1/s^2]."""
-BUDGET: Final = {"tolerance": 1e-12, "iterations": 50, "ls_tolerance": 1e-12, "ls_iterations": 50}
-"""Of MuJoDiCo's solvers, whose derivative is only as good as their solution [m/s for the first]."""
+BUDGET: Final = {"tolerance": 1e-13, "iterations": 50, "ls_tolerance": 1e-28, "ls_iterations": 8}
+"""Of MuJoDiCo's solvers, whose derivative is only as good as their solution. With its line search run to 1e-12 J, as
+the steps get small none of them is whole, and the last of 1e-12 m/s leaves as much."""
 CONE_FLOOR: Final = 1e-14
 """In place of MuJoDiCo's 1e-8, in float64, with which the derivative of `conic` is off by 2e-3."""
+FLOOR: Final = 1e-8
+"""Of the k by which MuJoDiCo divides."""
 FLAGS_OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 Step = tuple[Array, Array, Array, Array, Array]
-"""Positions, velocities and activations after a step, its acceleration, and the solver's relative residual."""
+"""Positions, velocities and activations after a step, its acceleration, and the solver's residual, relative to the
+forces and to the momentum over the timestep."""
+Equations = Callable[..., tuple[Array, Array, Array, Array]]
+"""From (model, qpos, qvel, act, control, qacc) to the left side of an equation in qacc with a symmetric Jacobian, and
+the positions, velocities and activations after the step."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +83,10 @@ class Law(ABC):
     @abstractmethod
     def step(self, scene: Scene, model: "LawModel", qpos: Array, qvel: Array, act: Array, control: Array) -> Step:
         """Advance by one timestep; differentiable in both modes."""
+
+    def equations(self, scene: Scene) -> "Equations | None":
+        """The equation that the acceleration solves, and the step at any; None if only `step` has the derivative."""
+        return None
 
 
 if TYPE_CHECKING:
@@ -132,20 +144,68 @@ class MujodicoLaw(Law):
                 raise ValueError(f"{self.name} does not support {what}")
 
     def step(self, scene: Scene, model: LawModel, qpos: Array, qvel: Array, act: Array, control: Array) -> Step:
-        theirs, template = _prepared(scene, self)
+        theirs, data = self._given(scene, model, qpos, qvel, act, control)
+        data = _package(self.name).forward(theirs, data)
+        mass, change = self._inertia(scene, theirs, data), jnp.stack([data.qacc, qvel / model.opt.timestep])
+        terms = [*(change @ mass), data.qfrc_smooth, data.qfrc_constraint]
+        gap = terms[0] - data.qfrc_smooth - data.qfrc_constraint
+        residual = _norm(gap) / (sum(map(_norm, terms)) + jnp.finfo(qvel.dtype).tiny)
+        return *self._integrated(scene, theirs, data), data.qacc, residual
+
+    def equations(self, scene: Scene) -> Equations | None:
+        """None where impulses are no functions of the velocity after the step: the cone's at limits and equalities."""
+        rows: Any = scene.template._impl
+        rigid = self.name == "conic" and rows.ne + rows.nl > 0
+        return None if rigid else functools.partial(self._equations, scene)
+
+    def _equations(
+        self, scene: Scene, model: LawModel, qpos: Array, qvel: Array, act: Array, control: Array, qacc: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        theirs, data = self._given(scene, model, qpos, qvel, act, control)
         own = _package(self.name)
+        for stage in (own.fwd_position, own.fwd_velocity, own.fwd_actuation, own.fwd_acceleration):
+            data = stage(theirs, data)
+        mass, force = self._inertia(scene, theirs, data), jnp.zeros_like(qvel)
+        if data._impl.efc_J.size:
+            impulses = self._impulses(theirs, data, qvel + model.opt.timestep * qacc)
+            force = data._impl.efc_J.T @ impulses / model.opt.timestep
+        moved = self._integrated(scene, theirs, data.replace(qacc=qacc, qfrc_constraint=force))
+        return mass @ qacc - data.qfrc_smooth - force, *moved
+
+    def _impulses(self, theirs: Any, data: Any, after: Float[Array, " nv"]) -> Float[Array, " rows"]:
+        """Impulses of constraint rows [N s or N m s] at a velocity after the step."""
+        from mujodico.mjx._src import solver_sap
+
+        if self.name != "conic":
+            return solver_sap._calc_constraint_impulse(solver_sap.Context.create(theirs, data).replace(qvel=after))
+        rows = data._impl
+        tau = rows.efc_b / jnp.maximum(rows.efc_k, FLOOR)
+        return self.smoothing / (rows.efc_J @ after + rows.efc_pos / (theirs.opt.timestep + tau))
+
+    def _given(self, scene: Scene, model: LawModel, qpos: Array, qvel: Array, act: Array, control: Array) -> Any:
+        """The package's model and data before a step."""
+        theirs, template = _prepared(scene, self)
         theirs = _with_arrays_of(theirs.replace(opt=_with_arrays_of(theirs.opt, model.opt)), model)
-        data = own.forward(theirs, template.replace(qpos=qpos, qvel=qvel, act=act, ctrl=control))
-        implicit = scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        after = own.implicit(theirs, data) if implicit else own.euler(theirs, data)
+        return theirs, template.replace(qpos=qpos, qvel=qvel, act=act, ctrl=control)
+
+    def _inertia(self, scene: Scene, theirs: Any, data: Any) -> Float[Array, "nv nv"]:
+        """The matrix that the package's solvers multiply accelerations with."""
+        own = _package(self.name)
         mass = own.full_m(theirs, data)
-        if implicit and (slope := own.deriv_smooth_vel(theirs, data)) is not None:
-            mass = mass - model.opt.timestep * slope
-        terms = mass @ data.qacc, data.qfrc_smooth, data.qfrc_constraint
-        residual = _norm(terms[0] - terms[1] - terms[2]) / (sum(map(_norm, terms)) + jnp.finfo(qvel.dtype).tiny)
+        if _implicit(scene) and (slope := own.deriv_smooth_vel(theirs, data)) is not None:
+            mass = mass - theirs.opt.timestep * slope
+        return mass
+
+    def _integrated(self, scene: Scene, theirs: Any, data: Any) -> tuple[Array, Array, Array]:
+        own = _package(self.name)
+        after = own.implicit(theirs, data) if _implicit(scene) else own.euler(theirs, data)
         # MJX's own integration loses the derivative of rotations at rest
-        moved = integrate_position(scene.host, qpos, after.qvel, model.opt.timestep)
-        return moved, after.qvel, after.act, data.qacc, residual
+        moved = integrate_position(scene.host, data.qpos, after.qvel, theirs.opt.timestep)
+        return moved, after.qvel, after.act
+
+
+def _implicit(scene: Scene) -> bool:
+    return scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
 LAWS: Final[dict[str, type[Law]]] = dict.fromkeys(
