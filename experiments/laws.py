@@ -55,13 +55,14 @@ LAWS: Final = {
     **{name: (name, "none") for name in ("smooth_onset", "penalty", *OTHERS)},
 }
 """Contact family and onset term by the name of a row."""
-FEW, MANY, CHUNK = 400, 4000, 250  # points, samples and pairs of other laws and of MuJoCo's
+POINTS, CHUNK = 4000, 250
+"""Points, samples and pairs; samples per call."""
 TIMESTEP, GAP, SPREAD = 0.005, 0.05, 0.005  # [s], [m], [m]
 SPEED, FRICTION, GRAVITY = 1.0, 1.0, 9.81  # [m/s], -, [m/s^2]
 SLOPE: Final = 0.5
 """Of the ground on which a ball of friction 1 rests."""
 STEPS: Final = (0.001, 0.002, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08)
-MEANS: Final = ("toss", "ball_wall", "slide", "corners", "box", "pusher", "tennis")
+MEANS: Final = ("toss", "ball_wall", "slide", "corners", "box", "pusher", "tennis", "landing")
 KAPPAS: Final = ("toss, kappa 0.1", "toss", "toss, kappa 10")
 ZEROTH: Final = "MuJoCo's default, zeroth order"
 THROWN: Final = """<mujoco><option timestep="{}"/><worldbody><geom name="floor" type="plane" size="20 20 1" condim="3"/>
@@ -123,7 +124,7 @@ SCENES: Final[dict[str, Callable[[], Task]]] = {
     **{"toss": toss, "slide": slide, "box": box, "corners": partial(box, "corners")},
     "ball_wall": partial(make_task, "ball_wall"),
 }
-SAMPLED: Final = ("pusher", "tennis")
+SAMPLED: Final = ("pusher", "tennis", "landing")
 TRAINED: Final = {
     "pusher": {"iterations": 200, "samples": (10,)},
     "ball_wall": {"iterations": 40, "samples": (30,), "learning_rate": 1.0},
@@ -164,7 +165,7 @@ def integrated(scene: str, family: str, onset: str, scale: float = 1.0) -> dict[
     """Slope of the mean cost, mean of the derivative, their errors, deviations of one sample, and time."""
     task, costs = line(scene, onset)
     contact, position = member(task, family, scale), np.asarray(task.theta, float)
-    points = grid(position[0], position[0], task.sigma, FEW if family in OTHERS else MANY, task.noise)
+    points = grid(position[0], position[0], task.sigma, POINTS, task.noise)
     values, slopes = costs(points, contact)
     begin = time.perf_counter()
     costs(points[:CHUNK], contact)
@@ -181,11 +182,10 @@ def sampled(name: str, family: str, onset: str) -> dict[str, Any]:
     """The same from samples; errors are standard errors."""
     task = make_task(name).replace(onset=onset)
     objective = Simulator(task, CHUNK).objective(member(task, family))
-    along = (
-        np.random.default_rng(1).normal(size=task.policy.num_params) if name == "tennis" else np.ones(task.theta.size)
-    )
+    drawn = np.random.default_rng(1).normal(size=task.policy.num_params)
+    along = np.ones(task.theta.size) if name == "pusher" else drawn
     along /= np.linalg.norm(along)
-    size = FEW if family in OTHERS else MANY
+    size = POINTS
     keys, pairs = (jax.random.split(jax.random.key(seed), size) for seed in range(2))
     reach = task.sigma / 2
     below, above = (np.asarray(objective.evaluate(task.theta + t * along, pairs).value) for t in (-reach, reach))
@@ -310,13 +310,13 @@ def corner(friction: float | None = None, timestep: float = 0.002, scale: float 
     contact, position, costs = member(task, "kelvin_voigt", scale), np.asarray(task.theta, float), Line(task)
     if friction is not None:
         contact = dataclasses.replace(contact, friction=jnp.array([friction, *task.scene.host.geom_friction[0, 1:]]))
-    points = grid(position[0], position[0], task.sigma, MANY, task.noise)
+    points = grid(position[0], position[0], task.sigma, POINTS, task.noise)
     values, slopes = costs(points, contact)
     slope = means(points, values, slopes, position, task.sigma, task.noise).slope[0]
     density = NOISES[task.noise].density((points - position[0]) / task.sigma) / task.sigma
     shares = density[1:-1] * (values[2:] - values[:-2]) / slope
     worst = 1 + int(np.argmax(np.abs(np.diff(values, 2)) * density[1:-1]))
-    inside = np.linspace(points[worst - 1], points[worst + 1], MANY + 1)
+    inside = np.linspace(points[worst - 1], points[worst + 1], POINTS + 1)
     fine = costs(inside, contact)[0]
     across = round(NARROW / (inside[1] - inside[0]))
     narrow = np.abs(fine[across:] - fine[:-across]).max() / abs(fine[-1] - fine[0])
@@ -336,7 +336,7 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
             found["pusher", row] = partial(sampled, "pusher", *each)
     for row, scale in itertools.product(("log_barrier", "hunt_crossley"), (0.1, 10.0)):
         found[f"toss, kappa {scale:g}", row] = partial(integrated, "toss", row, "none", scale)
-    for scene, (row, each) in itertools.product(("slide", "tennis", "box", "corners"), LAWS.items()):
+    for scene, (row, each) in itertools.product(("slide", "tennis", "landing", "box", "corners"), LAWS.items()):
         found[scene, row] = partial(sampled if scene in SAMPLED else integrated, scene, *each)
     for row, scale in itertools.product(("kelvin_voigt", "conic"), (0.1, 10.0)):
         found[f"toss, kappa {scale:g}", row] = partial(integrated, "toss", row, "none", scale)
