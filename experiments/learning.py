@@ -276,16 +276,7 @@ def best(lines: list[dict[str, Any]], name: str, method: str) -> tuple[float, in
     return tuned["pairs"][int(np.argmin(np.mean(tuned["final"], axis=1)))]
 
 
-HEADINGS: Final = (
-    "method",
-    "learning rate, window",
-    "seeds",
-    "cost",
-    "in C: cost per s",
-    "distance [m]",
-    "4 s in C: cost per s",
-    "distance [m]",
-)
+HEADINGS: Final = ("method", "rate, window", "cost", "1 s in C: cost", "4 s in C: cost per s", "distance [m]")
 TICKS: Final = (0.15, 0.2, 0.3, 0.5, 1.0, 2.0)
 
 
@@ -320,24 +311,22 @@ def figure(lines: list[dict[str, Any]], name: str) -> Figure:
 
 def table(lines: list[dict[str, Any]], name: str) -> str:
     """Final costs of the new seeds, with 95 % intervals by Student's t, and what their policies do in the C engine."""
-    columns = ("final", "cost_trained", "distance_trained", "cost_longer", "distance_longer")
+    columns = ("final", "cost_trained", "cost_longer", "distance_longer")
     rows = []
     for method in [*METHODS, "ppo"]:
         seeds = [each for each in lines if (each["task"], each["method"]) == (name, method) and each["what"] != "tune"]
         seeds = [each for each in seeds if each.get("seed", 100) >= 100]
         if seeds:
             numbers = [np.concatenate([np.ravel(each[column]) for each in seeds]) for column in columns]
-            window = f", {each} of {PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
+            window = f", {each}/{PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
             chosen = f"{seeds[0]['rate']:.2g}{window}"
-            rows.append(
-                (f"`{method}`" if method != "ppo" else "PPO", chosen, len(numbers[0]), *map(_with_interval, numbers))
-            )
+            rows.append((f"`{method}`" if method != "ppo" else "PPO", chosen, *map(_with_interval, numbers)))
     return markdown_table(rows, HEADINGS)
 
 
 def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:
     half = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
-    return f"{np.mean(values):.3f} ± {half:.3f}"
+    return f"{np.mean(values):.2f} ± {half:.2f}"
 
 
 def report(path: str) -> None:
