@@ -277,16 +277,7 @@ def best(lines: list[dict[str, Any]], name: str, method: str) -> tuple[float, in
     return found["pairs"][int(np.argmin(np.mean(found["final"], axis=1)))]
 
 
-HEADINGS: Final = (
-    "method",
-    "learning rate, window",
-    "seeds",
-    "cost",
-    "in C: cost per s",
-    "distance [m]",
-    "4 s in C: cost per s",
-    "distance [m]",
-)
+HEADINGS: Final = ("method", "rate, window", "cost", "in C: cost", "4 s in C: cost", "distance [m]")
 TICKS: Final = (0.15, 0.2, 0.3, 0.5, 1.0, 2.0)
 """Of the quadruped's cost, which is positive."""
 HIGHEST: Final = 0.2
@@ -332,16 +323,14 @@ def _new_seeds(lines: list[dict[str, Any]], name: str, method: str) -> list[dict
 
 def table(lines: list[dict[str, Any]], name: str) -> str:
     """Final costs of the new seeds, with 95 % intervals by Student's t, and what their policies do in the C engine."""
-    columns = ("final", "cost_trained", "distance_trained", "cost_longer", "distance_longer")
+    columns = ("final", "cost_trained", "cost_longer", "distance_longer")
     rows = []
     for method in [*METHODS, "ppo"]:
         if seeds := _new_seeds(lines, name, method):
             numbers = [np.concatenate([np.ravel(each[column]) for each in seeds]) for column in columns]
-            window = f", {each} of {PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
+            window = f", {each}/{PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
             chosen = f"{seeds[0]['rate']:.2g}{window}"
-            rows.append(
-                (f"`{method}`" if method != "ppo" else "PPO", chosen, len(numbers[0]), *map(_with_interval, numbers))
-            )
+            rows.append((f"`{method}`" if method != "ppo" else "PPO", chosen, *map(_with_interval, numbers)))
     return markdown_table(rows, HEADINGS)
 
 

@@ -31,6 +31,7 @@ SMALL = {
     ),
     "5_identify_contact": "TOSSES, STEPS = 2, 60",
     "6_teach_a_robot": "STEPS, SAMPLES, UPDATES = 80, 2, 2",
+    "7_teach_a_quadruped": "STEPS, SAMPLES, UPDATES, SEEDS, STARTS, SECONDS, PACE = 16, 2, 2, 1, 1, 0.4, 0.5",
 }
 """Parameters of a short run."""
 ABSOLUTE = re.compile(r"(?<![\w.~])/(?:home|root|Users|tmp|var|usr|opt|mnt|srv|private|proc)/|[A-Z]:\\\\")

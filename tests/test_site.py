@@ -53,6 +53,17 @@ def test_formulas_become_mathml() -> None:
     assert "<msub><mi>a</mi><mn>0</mn></msub>" in found and "<mfrac>" in found and "`" not in found
 
 
+def test_films_of_notebooks_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of docs/ are the same, of the last run."""
+    monkeypatch.setattr(site, "PAGES", tmp_path)
+    (tmp_path / "notebooks").mkdir()
+    for stem in ("6_teach_a_robot", "7_teach_a_quadruped"):
+        page = "\n".join(site.parts_of_notebook(Path("notebooks", f"{stem}.ipynb"), PATHS))
+        (film,) = (tmp_path / "notebooks").glob(f"{stem}-*.gif")
+        assert f"({film.name})" in page and "<IPython" not in page
+        assert film.read_bytes() == (ROOT / "docs" / f"film_{stem}.gif").read_bytes()
+
+
 @pytest.mark.parametrize("package", site.PACKAGES)
 def test_the_page_of_a_package_has_all_public_names(package: str) -> None:
     page = site.page_of_names(package)

@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "build" / "pages"
 PIPED: Final = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
 PACKAGES = ("mjx_study", "mjx_study.gradcheck", "estimators")
-OUTPUT = {"image/png": "png", "text/html": "html", "text/plain": "text"}
+OUTPUT = "image/gif", "image/png", "text/html", "text/plain"
 """Kinds of notebook outputs, the best first."""
 
 
@@ -86,9 +86,9 @@ def parts_of_notebook(path: Path, paths: dict[Path, Path]) -> Iterator[str]:
                 yield f"``` {{ .text .output }}\n{output.text.rstrip()}\n```"
                 continue
             kind = next(kind for kind in OUTPUT if kind in output.data)
-            if kind == "image/png":
+            if kind.startswith("image/"):
                 pictures += 1
-                picture = folder / f"{path.stem}-{pictures}.png"
+                picture = folder / f"{path.stem}-{pictures}.{kind.removeprefix('image/')}"
                 picture.write_bytes(base64.b64decode(output.data[kind]))
                 yield f"![Output of the cell above]({picture.name})"
             elif kind == "text/html":
