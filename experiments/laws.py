@@ -1,6 +1,7 @@
 """Tables of docs/which-contact.md: what each contact law's first-order gradients cost and buy.
 
-    python -m experiments.laws             # measure what data/laws.jsonl lacks, with the extra `laws`; an hour
+    python -m experiments.laws             # measure what data/laws*.jsonl lack, with the extra `laws`
+    python -m experiments.laws gradcheck   # the same of one scene, or kind of scene
     python -m experiments.laws page        # write the tables
 
 All at MuJoCo's default stiffness: K is that of solref (0.02, 1) for the contact's effective mass. In `SCENES` noise

@@ -109,8 +109,8 @@ def test_gradcheck_counts_what_has_no_counterpart(capsys: pytest.CaptureFixture[
     assert said.startswith("hunt_crossley, K = 1000 N/m: 3 states not compared with mjx.step and the C engine")
 
 
+@pytest.mark.usefixtures("shared_programs")
 def test_a_sweep_over_laws_resumes_to_the_same_numbers(tmp_path: Path) -> None:
-    """Of MuJoCo's law and another's, in two programs each, the other's the one that differentiates as a graph."""
     families: dict[str, Any] = {"contact": ("mujoco", "kelvin_voigt"), "stiffness": (100.0, 1000.0), "samples": (4,)}
     about = StudyConfig(tasks=("pusher",), horizon=20, reference_samples=6, seeds=2, **families)
     whole = run_study(about, tmp_path)

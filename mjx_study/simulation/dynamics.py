@@ -145,11 +145,14 @@ def _step_of_law(scene: Scene, model: LawModel, state: State, control: Control) 
     def rule(primals: Any, changes: Any) -> Any:
         after, (traced, *point), (of_model, *moved) = advance(*primals), primals, changes
         through = lambda _, traced, *point: values(whole(traced), *point)[:4]  # noqa: E731
-        change = None
-        if equations is not None and not jax.tree.leaves(of_model):
-            whole_change = instantiated(tuple(point), tuple(moved))
+        change, leaves = None, [pair for pair in zip(traced, of_model, strict=True) if pair[0] is not None]
+        if equations is not None and all(each is None or isinstance(leaf, Tracer) for leaf, each in leaves):
             at_model = lambda qacc, *point: through(qacc, traced, *point)  # noqa: E731
-            change = by_graph(equations, at_model, whole(traced), point, after[3], whole_change)
+            over_state = instantiated(tuple(point), tuple(moved))
+            over_model = (
+                [each for leaf, each in leaves if isinstance(leaf, Tracer)] if jax.tree.leaves(of_model) else []
+            )
+            change = by_graph(equations, at_model, whole(traced), point, after[3], over_state, over_model)
         change = change or by_tape(through, after[3], (traced, *point), (of_model, *moved))
         return after, (*change, jnp.zeros_like(after[4]))
 
@@ -388,6 +391,7 @@ def by_graph(
     point: Sequence[Array],
     qacc: Qvel,
     change: Sequence[Array | None],
+    of_model: Sequence[Array | None] = (),
 ) -> StepChange | None:
     """Change of a step and of its acceleration as a graph, if it is one and worth compiling.
 
@@ -401,6 +405,7 @@ def by_graph(
         point: what precedes the step.
         qacc: the converged constrained acceleration there.
         change: change of the point, None for arrays that do not change.
+        of_model: change of the model's traced arrays, likewise; empty if none changes.
     """
     if isinstance(model.body_mass, Tracer):
         return None
@@ -409,9 +414,10 @@ def by_graph(
     captured = captured_once(equations, like, *map(kind, (*point, qacc)))
     if captured is None:
         return None
-    inputs = [*(leaf for leaf in jax.tree.leaves(model) if isinstance(leaf, Tracer)), *point, qacc]
-    over = tuple(len(inputs) - 1 - len(point) + at for at, each in enumerate(change) if each is not None)
-    changes = [each for each in change if each is not None]
+    traced = [leaf for leaf in jax.tree.leaves(model) if isinstance(leaf, Tracer)]
+    inputs, whole_change = [*traced, *point, qacc], [*(of_model or [None] * len(traced)), *change]
+    over = tuple(at for at, each in enumerate(whole_change) if each is not None)
+    changes = [each for each in whole_change if each is not None]
 
     def plain(inputs: Sequence[Any], changes: Sequence[Any]) -> Any:
         *point, qacc = inputs[-1 - len(change) :]
@@ -421,7 +427,8 @@ def by_graph(
     try:
         if native_identity() is not None:
             slope = implicit_derivative(captured, over, solve_positive_definite)
-            return tuple(applied(slope, inputs, changes, plain)) if is_small(slope.push) else None
+            left = None if of_model else plain
+            return tuple(applied(slope, inputs, changes, left)) if is_small(slope.push) else None
         matrix = implicit_jacobian(captured, over, solve_positive_definite)
     except NotDifferentiableError as error:
         count_left(f"derivative of {error}")
