@@ -118,7 +118,7 @@ def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
 
 
 def _body(
-    closed: Any, inputs: Sequence[Any], fixed: Sequence[bool], wanted: Sequence[int], carried: Sequence[int]
+    closed: Any, inputs: Sequence[Any], fixed: Sequence[bool], wanted: Sequence[int], carried: range
 ) -> tuple[ScalarFunction, list[int]]:
     """Body of a scan as a graph of some of its outputs, and the places of the inputs that it has.
 
@@ -128,9 +128,11 @@ def _body(
     """
     graph = ScalarGraph(2 * MOST_OPERATIONS, values_only=True)
     given = []
-    for each, known, aval in zip(inputs, fixed, closed.in_avals, strict=True):
+    for place, (each, known, aval) in enumerate(zip(inputs, fixed, closed.in_avals, strict=True)):
         value = each if aval.size else np.zeros(aval.shape, aval.dtype)
         given.append(constants(value) if known else graph.fresh("input", aval.shape, aval.dtype))
+        if not known and place < carried.start:
+            graph.arrays |= dict.fromkeys((node.number for node in given[-1].flat), place)
     outputs = run(graph, closed, given)
     free = [place for place, known in enumerate(fixed) if not known]
     function = ScalarFunction(

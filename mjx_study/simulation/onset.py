@@ -30,7 +30,7 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 (arXiv 2306.06862), for the continuous-time limit.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -41,7 +41,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
-from mjx_study.graph.derivative_rule import instantiated, refusing, with_rule
+from mjx_study.graph.derivative_rule import flat_with_rule, instantiated, refusing, with_rule
 from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
@@ -53,6 +53,7 @@ from mjx_study.simulation.dynamics import (
     Controls,
     Point,
     Qpos,
+    RunningCost,
     State,
     advance_velocity,
     entry_by_entry,
@@ -66,7 +67,7 @@ from mjx_study.simulation.dynamics import (
 )
 from mjx_study.simulation.guards import Course
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Events, OnsetCounts, Touch, at_touch, find_events
 
@@ -96,22 +97,36 @@ def corrected_rollout(
     horizon: int,
     slots: int = SLOTS,
     weight: float | Scalar = 1.0,
-    inputs: Any = None,
 ) -> tuple[State, Controls, Float[Array, " horizon"], OnsetCounts]:
-    """`dynamics.rollout` with the same values, but derivatives that include the onset term.
+    """`dynamics.rollout` with the same values, but derivatives that include the onset term; see `corrected`."""
+    law = control_law, jnp.arange(horizon)
+    last, found, counts = corrected(scene, model, start, *law, lambda *_: None, slots, weight)
+    states, controls, residuals, _ = found
+    return trajectory(states, last), controls, residuals, counts
+
+
+def corrected(
+    scene: Scene,
+    model: mjx.Model,
+    start: State,
+    control_law: ControlLaw,
+    inputs: Any,
+    running_cost: RunningCost,
+    slots: int = SLOTS,
+    weight: float | Scalar = 1.0,
+) -> tuple[State, tuple[State, Controls, Float[Array, " horizon"], Any], OnsetCounts]:
+    """`dynamics.simulated` with the same values, but derivatives that include the onset term.
 
     First derivatives with respect to initial state and controls, in forward and reverse mode.
 
     Args:
         model: the model to step; may be traced, but not differentiated (TypeError).
         slots: maximum number of events to correct, earliest first.
-        weight: factor of the term; 0 gives the derivatives of `dynamics.rollout`.
-        inputs: inputs of the control law, as for `dynamics.simulated`; None for the steps' indices.
+        weight: factor of the term; 0 gives the derivatives of `dynamics.simulated`.
     """
-    inputs = jnp.arange(horizon) if inputs is None else inputs
     if not scene.has_constraints:
-        last, (states, controls, residuals, _) = simulated(scene, model, start, control_law, inputs, lambda *_: None)
-        return trajectory(states, last), controls, residuals, OnsetCounts.none(start.qpos.dtype)
+        found = simulated(scene, model, start, control_law, inputs, running_cost)
+        return *found, OnsetCounts.none(start.qpos.dtype)
     model = without_derivative(model)
 
     def observe(state: State, given: Any):
@@ -119,31 +134,30 @@ def corrected_rollout(
         following, residual, course = solved_step(scene, model, state, control)
         return following, (state, control, following, residual, course)
 
-    _, (before, controls, after, residuals, course) = jax.lax.scan(observe, jax.lax.stop_gradient(start), inputs)
+    last, (before, controls, after, residuals, course) = jax.lax.scan(observe, jax.lax.stop_gradient(start), inputs)
     terms, first, counts = _corrections(scene, model, before, controls, course, slots)
-
-    rows = jnp.arange(min(PER_STEP, slots, course.distance.shape[1]))
+    spread, shift, slope = jax.lax.stop_gradient((weight * terms.spread, weight * terms.shift, terms.slope))
 
     def follow(state: State, known):
-        given, fixed, after, (first, following) = known
-        control = control_law(given, state)
-        own, used = jnp.minimum(first + rows, max(slots - 1, 0)), (first + rows < following)[:, None]
-        spread, shift, slope = (jnp.where(used, leaf[own], 0) for leaf in terms)
+        given, fixed, control, after, own = known
+        state = _moving(fixed, state)
+        control = _moving(control, control_law(given, state))
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
-        velocity = tangent_along(shift, slope, moved - scene.timestep * state.qvel)
+        velocity = tangent_of(along_events(shift, slope, own, moved - scene.timestep * state.qvel))
         qpos = integrate_position(scene.host, state.qpos, velocity, scene.timestep)
         qvel, act = _known_step(scene, model, (qpos, state.qvel + velocity, state.act, control), after)
-        qvel = qvel + tangent_along(spread, slope, moved)
+        qvel = qvel + tangent_of(along_events(spread, slope, own, moved))
         following = State(integrate_position(scene.host, qpos, qvel, scene.timestep), qvel, act, after.warmstart)
-        return following, (following, control)
+        return following, (state, control, running_cost(state, control))
 
-    terms = terms._replace(spread=weight * terms.spread, shift=weight * terms.shift)
-    _, (states, over_controls) = jax.lax.scan(follow, start, (inputs, before, after, (first[:-1], first[1:])))
-    states, controls = jax.tree.map(
-        lambda known, each: known + tangent_of(each), (after, controls), (states, over_controls)
-    )
-    whole = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
-    return whole, controls, residuals, counts
+    known = inputs, before, controls, after, (first[:-1], first[1:])
+    moving, (states, controls, costs) = jax.lax.scan(follow, start, known)
+    return _moving(last, moving), (states, controls, residuals, costs), counts
+
+
+def _moving(known: Any, moving: Any) -> Any:
+    """Known values, with the derivatives of others."""
+    return jax.tree.map(lambda value, each: value + tangent_of(each), known, moving)
 
 
 def _known_step(scene: Scene, model: mjx.Model, point: Point, after: State) -> tuple[Qvel, Act]:
@@ -373,12 +387,34 @@ _tangent_of = with_rule(
 differentiated_once = refusing("derivatives with the onset term are of first order: it has no second derivative")
 
 
-def tangent_along(
-    jumps: Float[Array, "events nv"], slopes: Float[Array, "events nv"], moved: Float[Array, " nv"]
+def along_events(
+    jumps: Float[Array, "slots nv"],
+    slopes: Float[Array, "slots nv"],
+    own: tuple[Int[Array, ""], Int[Array, ""]],
+    moved: Float[Array, " nv"],
 ) -> Float[Array, " nv"]:
-    """Zero, whose derivative is the sum of the jumps times the slopes' products with that of the motion."""
-    jumps, slopes = jax.lax.stop_gradient((jumps, slopes))
-    return tangent_of(product(jumps.T, product(slopes, moved)))
+    """Sum of some events' jumps times their slopes' products with a motion, linear in the latter.
+
+    Args:
+        own: the first of the events, and the one after the last.
+    """
+
+    def total(jumps: Array, slopes: Array, first: Array, last: Array, moved: Array) -> list[Array]:
+        add = lambda carry: (carry[0] + 1, carry[1] + jumps[carry[0]] * jnp.sum(slopes[carry[0]] * moved))  # noqa: E731
+        return [jax.lax.while_loop(lambda carry: carry[0] < last, add, (first, jnp.zeros_like(moved)))[1]]
+
+    def rule(primals: Sequence[Any], changes: Sequence[Any]) -> Any:
+        return linear(*primals), linear(*primals[:-1], changes[-1])
+
+    def transpose(fixed: Sequence[Any], adjoints: Sequence[Any]) -> list[Any]:
+        jumps, slopes, first, last, _ = fixed
+        return [*[None] * 4, along_events(slopes, jumps, (first, last), adjoints[0])]
+
+    def linear(*arguments: Array) -> list[Array]:
+        return flat_with_rule(total, arguments, rule, transpose)
+
+    (found,) = linear(jumps, slopes, *own, moved)
+    return found
 
 
 def without_derivative(model: mjx.Model) -> mjx.Model:
