@@ -214,4 +214,5 @@ def test_corners_that_replace_each_other_are_counted(second: list[float], begins
     points = guards.Points(place, jnp.full((2, 2), 0.01), jnp.tile(jnp.array([0, 1]), (2, 2, 1)))
     course = guards.Course(touching, touching, touching, touching, touching < 0, points)
     crossing = none.at[1, 1:].set(np.arange(2) == begins)  # the first guard is a limit
-    assert replaced_points(course, Crossings(crossing, none, touching)) == number
+    before, here = (jax.tree.map(lambda leaf, at=at: leaf[at], course) for at in (0, 1))
+    assert replaced_points(here, before, Crossings(crossing[1], none[1], touching[1])) == number

@@ -78,11 +78,13 @@ class ScalarGraph:
         most: maximum number of nodes, beyond which new ones raise `TooLargeError`; None for any number.
         values_only: whether calls with a derivative of their own are written out, too, which loses it.
         arrays: inputs by the numbers of their entries, if computed indices may read them in memory.
+        called: number of operations that come from native code.
     """
 
     def __init__(self, most: int | None, values_only: bool = False):
         self.most, self.values_only, self._count = most, values_only, 0
         self.arrays: dict[int, int] = {}
+        self.called = 0
         self._known: dict[Any, Node] = {}
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:
@@ -158,7 +160,7 @@ class ScalarGraph:
 
         None if they are not in memory, at equal distances.
         """
-        numbers = [each.number if isinstance(each, Node) else None for each in cases]
+        numbers = [each.number if isinstance(each, Node) else 0 for each in cases]
         places = {self.arrays.get(number) for number in numbers}
         if None in places or len(places) > 1 or cases[0].dtype == bool:
             return None

@@ -22,13 +22,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mjx_study.simulation import guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Scalar
 from mjx_study.simulation.dynamics import Control, ControlLaw, Controls, State, solved_step, step, with_solver
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.onset import Passage, least_travel, passage
 from mjx_study.simulation.scene import Scene
-from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, find_events
+from mjx_study.simulation.touch import Events, OnsetCounts, Past, at_touch, changes, events_of
 
 SLOTS: Final = 8
 """Number of events with branches of their own per rollout; later ones are only counted."""
@@ -54,7 +55,7 @@ def jump_term(
         slots: maximum number of events to correct, earliest first.
     """
     before, controls = jax.lax.stop_gradient((jax.tree.map(lambda leaf: leaf[:-1], states), controls))
-    if not scene.has_constraints:
+    if not guards.num_guards(scene.template):
         return jnp.zeros_like(before.qpos, shape=()), OnsetCounts.none(before.qpos.dtype)
 
     def cost_to_go(index, state):
@@ -69,7 +70,10 @@ def jump_term(
         return total + final_cost(last)
 
     course = jax.vmap(lambda state, control: solved_step(scene, model, state, control)[-1])(before, controls)
-    events, without = find_events(course, scene.timestep, slots)
+    past = Past.none(jax.tree.map(lambda leaf: leaf[0], course))
+    past, found = jax.lax.scan(lambda past, here: changes(here, past, scene.timestep), past, course)
+    events = events_of(found, slots)
+    slots = len(events.used)
     filled = jnp.sum(events.used)
     weights = jnp.zeros((slots, 2, scene.host.nv), before.qpos.dtype)
     flags = jnp.zeros((slots, 2), bool)
@@ -88,7 +92,7 @@ def jump_term(
         before.qpos[at], states.qpos[at]
     )
     narrow, valid = flags.T
-    return jnp.sum(weights * moved), events.counts(without, valid, narrow, jnp.zeros(slots, weights.dtype))
+    return jnp.sum(weights * moved), events.counts(past, valid, narrow, jnp.zeros(slots, weights.dtype))
 
 
 def _weights(

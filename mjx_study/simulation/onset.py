@@ -30,6 +30,7 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 (arXiv 2306.06862), for the continuous-time limit.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
@@ -42,7 +43,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
 from mjx_study.graph.derivative_rule import flat_with_rule, instantiated, refusing, with_rule
-from mjx_study.graph.scalars import traced_part
+from mjx_study.graph.scalars import traced_part, unrolled
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Rows, Scalar
@@ -65,16 +66,13 @@ from mjx_study.simulation.dynamics import (
     trajectory,
     with_solver,
 )
-from mjx_study.simulation.guards import Course
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED
 from mjx_study.simulation.scene import Scene
-from mjx_study.simulation.touch import Events, OnsetCounts, Touch, at_touch, find_events
+from mjx_study.simulation.touch import Changes, Events, OnsetCounts, Past, Touch, at_touch, changes, events_of
 
 SLOTS: Final = 32
 """Number of events corrected per rollout; later ones are only counted."""
-PER_STEP: Final = 4
-"""Number of events corrected per step; further ones are only counted."""
 TOGETHER: Final = 8
 """Number of events that an accelerator computes in the time of one."""
 
@@ -124,40 +122,52 @@ def corrected(
         slots: maximum number of events to correct, earliest first.
         weight: factor of the term; 0 gives the derivatives of `dynamics.simulated`.
     """
-    if not scene.has_constraints:
+    if not guards.num_guards(scene.template):
         found = simulated(scene, model, start, control_law, inputs, running_cost)
         return *found, OnsetCounts.none(start.qpos.dtype)
     model = without_derivative(model)
 
-    def observe(state: State, given: Any):
-        control = jax.lax.stop_gradient(control_law(given, state))
+    def observe(carry: tuple[State, Past], given: Any):
+        state, past = carry
+        control, cost = jax.lax.stop_gradient(acted(given, state))
         following, residual, course = solved_step(scene, model, state, control)
-        return following, (state, control, following, residual, course)
+        past, found = unrolled(changes, course, past, scene.timestep)
+        return (following, past), (state, control, following, residual, cost, found)
 
-    last, (before, controls, after, residuals, course) = jax.lax.scan(observe, jax.lax.stop_gradient(start), inputs)
-    terms, first, counts = _corrections(scene, model, before, controls, course, slots)
+    def acted(given: Any, state: State):
+        control = control_law(given, state)
+        return control, running_cost(state, control)
+
+    begin = jax.lax.stop_gradient(start)
+    course = lambda given: solved_step(scene, model, begin, control_law(given, begin))[2]  # noqa: E731
+    like = jax.eval_shape(course, jax.tree.map(lambda leaf: leaf[0], inputs))
+    (last, past), known = jax.lax.scan(observe, (begin, Past.none(like)), inputs)
+    before, controls, after, residuals, costs, found = known
+    terms, counts = _corrections(scene, model, before, controls, found, past, slots)
     spread, shift, slope = jax.lax.stop_gradient((weight * terms.spread, weight * terms.shift, terms.slope))
 
     def follow(state: State, known):
-        given, fixed, control, after, own = known
+        given, fixed, values, after, own = known
         state = _moving(fixed, state)
-        control = _moving(control, control_law(given, state))
+        control, cost = _moving(values, acted(given, state))
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
         velocity = tangent_of(along_events(shift, slope, own, moved - scene.timestep * state.qvel))
-        qpos = integrate_position(scene.host, state.qpos, velocity, scene.timestep)
-        qvel, act = _known_step(scene, model, (qpos, state.qvel + velocity, state.act, control), after)
+        shifted = integrate_position(scene.host, state.qpos, velocity, scene.timestep), state.qvel + velocity
+        qpos, qvel = _moving((fixed.qpos, fixed.qvel), shifted)
+        qvel, act = _known_step(scene, model, (qpos, qvel, state.act, control), after)
         qvel = qvel + tangent_of(along_events(spread, slope, own, moved))
         following = State(integrate_position(scene.host, qpos, qvel, scene.timestep), qvel, act, after.warmstart)
-        return following, (state, control, running_cost(state, control))
+        return following, (state, control, cost)
 
-    known = inputs, before, controls, after, (first[:-1], first[1:])
+    own = jnp.minimum(found.before, slots), jnp.minimum(found.after, slots)
+    known = inputs, before, (controls, costs), after, own
     moving, (states, controls, costs) = jax.lax.scan(follow, start, known)
     return _moving(last, moving), (states, controls, residuals, costs), counts
 
 
 def _moving(known: Any, moving: Any) -> Any:
     """Known values, with the derivatives of others."""
-    return jax.tree.map(lambda value, each: value + tangent_of(each), known, moving)
+    return jax.tree.map(_with_tangent, known, moving)
 
 
 def _known_step(scene: Scene, model: mjx.Model, point: Point, after: State) -> tuple[Qvel, Act]:
@@ -191,10 +201,10 @@ class Terms(NamedTuple):
 
 
 def _corrections(
-    scene: Scene, model: mjx.Model, before: State, controls: Controls, course: Course, slots: int
-) -> tuple[Terms, Int[Array, " horizon_and_1"], OnsetCounts]:
-    """Terms of the events, the first event of every step, and counts."""
-    events, without = find_events(course, scene.timestep, slots, PER_STEP)
+    scene: Scene, model: mjx.Model, before: State, controls: Controls, found: Changes, past: Past, slots: int
+) -> tuple[Terms, OnsetCounts]:
+    """Terms of the events, and counts."""
+    events = events_of(found, slots)
 
     def term(event: Events):
         pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
@@ -203,22 +213,19 @@ def _corrections(
             return onset_term(with_solver, model, scene.template, states, inputs, event)
         return entry_by_entry(partial(onset_term, with_run_solver), model, scene.template, states, inputs, event)
 
-    def fill(carry):
-        slot, found = carry
-        some = jnp.minimum(slot + jnp.arange(together), slots - 1)
-        more = jax.vmap(term)(jax.tree.map(lambda leaf: leaf[some], events))
-        return slot + together, jax.tree.map(lambda every, one: every.at[some].set(one), found, more)
+    def fill(_: None, some: Events):
+        """Terms of a few events; a loop, which ends at once where no sample has any."""
+        none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(every, some))
+        once = lambda carry: (jnp.zeros((), bool), every(some))  # noqa: E731
+        return None, jax.lax.while_loop(lambda carry: carry[0], once, (jnp.any(some.used), none))[1]
 
-    together = 1 if jax.default_backend() == "cpu" else min(TOGETHER, slots)
-    filled, dtype = jnp.sum(events.used), course.distance.dtype
-    vector, flag = jnp.zeros((max(slots, 1), scene.host.nv), dtype), jnp.zeros(slots, bool)
-    found = Terms(vector, vector, vector), jnp.zeros(slots, dtype), flag, flag
-    if slots:  # not a scan: the loop over a batch ends with the last event of any rollout
-        _, found = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, (jnp.zeros_like(filled), found))
-    terms, strength, narrow, valid = found
-    starts = jnp.arange(len(before.qpos) + 1)
-    first = jnp.sum(jnp.where(events.used, events.step, len(starts)) < starts[:, None], axis=1)
-    return terms, first, events.counts(without, valid, narrow, strength)
+    every, few = (term, ()) if jax.default_backend() == "cpu" else (jax.vmap(term), (TOGETHER,))
+    slots = len(events.used)
+    grouped = jax.tree.map(lambda leaf: jnp.resize(leaf, (-(-slots // math.prod(few)), *few, *leaf.shape[1:])), events)
+    _, each = jax.lax.scan(fill, None, grouped)
+    flat = lambda leaf: leaf.reshape(-1, *leaf.shape[1 + len(few) :])[:slots]  # noqa: E731
+    terms, strength, narrow, valid = jax.tree.map(flat, each)
+    return terms, events.counts(past, valid, narrow, strength)
 
 
 Moving = Mapping[int, Array]
@@ -378,12 +385,15 @@ def least_travel(model: mjx.Model, found: Passage, ends: Bool[Array, ""]) -> Sca
 
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
     """Zero, with the derivative of `value`; differentiating it again raises TypeError."""
-    return _tangent_of(value)
+    return _with_tangent(jnp.zeros_like(value), value)
 
 
-_tangent_of = with_rule(
-    jnp.zeros_like, lambda primals, changes: (_tangent_of(differentiated_once(*primals)), changes[0])
-)
+def _of_second(primals: Any, changes: Any) -> Any:
+    return _with_tangent(primals[0], differentiated_once(primals[1])), changes[1]
+
+
+_with_tangent = with_rule(lambda value, moving: value, _of_second)
+"""A value without its own derivative, with that of another; differentiating it again raises TypeError."""
 differentiated_once = refusing("derivatives with the onset term are of first order: it has no second derivative")
 
 
