@@ -43,7 +43,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
 from mjx_study.graph.derivative_rule import flat_with_rule, instantiated, refusing, with_rule
-from mjx_study.graph.scalars import traced_part, unrolled
+from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Rows, Scalar
@@ -60,8 +60,8 @@ from mjx_study.simulation.dynamics import (
     entry_by_entry,
     force_stage,
     fwd_position,
+    observed_step,
     simulated,
-    solved_step,
     step_change,
     trajectory,
     with_solver,
@@ -130,8 +130,7 @@ def corrected(
     def observe(carry: tuple[State, Past], given: Any):
         state, past = carry
         control, cost = jax.lax.stop_gradient(acted(given, state))
-        following, residual, course = solved_step(scene, model, state, control)
-        past, found = unrolled(changes, course, past, scene.timestep)
+        following, residual, past, found = with_solver(partial(_observed, scene), model, state, control, past)
         return (following, past), (state, control, following, residual, cost, found)
 
     def acted(given: Any, state: State):
@@ -139,7 +138,8 @@ def corrected(
         return control, running_cost(state, control)
 
     begin = jax.lax.stop_gradient(start)
-    course = lambda given: solved_step(scene, model, begin, control_law(given, begin))[2]  # noqa: E731
+    step = partial(observed_step, scene, constraint.run_solver, model)
+    course = lambda given: step(begin, control_law(given, begin))[2]  # noqa: E731
     like = jax.eval_shape(course, jax.tree.map(lambda leaf: leaf[0], inputs))
     (last, past), known = jax.lax.scan(observe, (begin, Past.none(like)), inputs)
     before, controls, after, residuals, costs, found = known
@@ -163,6 +163,11 @@ def corrected(
     known = inputs, before, (controls, costs), after, own
     moving, (states, controls, costs) = jax.lax.scan(follow, start, known)
     return _moving(last, moving), (states, controls, residuals, costs), counts
+
+
+def _observed(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Control, past: Past):
+    after, residual, course = observed_step(scene, solver, model, state, control)
+    return after, residual, *changes(course, past, scene.timestep)
 
 
 def _moving(known: Any, moving: Any) -> Any:
@@ -259,13 +264,14 @@ def onset_term(
     qpos, qvel = states.qpos[0], states.qvel[0]
     touch: Touch = call(at_touch, model, template, qpos, qvel, event)
 
-    def both(*before):
-        each = lambda off: call(passage, model, template, touch.qpos, qvel, *before, event, off)  # noqa: E731
-        return jax.vmap(each)(jnp.array([0.0, 1.0], qvel.dtype))
-
-    found: Passage = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
-    jumps, first = found.qvel[:, 0] - found.qvel[:, 1], jax.tree.map(lambda leaf: leaf[0], found)
-    least, normal = least_travel(model, first, event.ends), first.normal[0]
+    found: list[Passages] = []
+    for at in range(len(states.qvel)):
+        # the solution of one case is close to that of the other
+        warmstart = found[-1].qacc if found else jnp.tile(states.warmstart[0], (2, 1))
+        before = states.qvel[at], states.act[at], controls[at], warmstart
+        found.append(call(passages, model, template, touch.qpos, qvel, *before, event))
+    jumps = [each.qvel[0] - each.qvel[1] for each in found]
+    least, normal = least_travel(model, found[0], event.ends), found[0].normal
     cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
     last, before = touch.weights
     slope = normal
@@ -323,26 +329,26 @@ def guard_at(model: mjx.Model, positioned: mjx.Data, qvel: Qvel, event: Events) 
     return GuardAtTouch(weights, deep, members[event.guard], absent, touching)
 
 
-class Passage(NamedTuple):
-    """A step from the touch of a guard, with its rows on or off; or two, with them on and off.
+class Passages(NamedTuple):
+    """Two steps from the touch of a guard, first with its rows on, then with them off.
 
     Attributes:
-        qvel, act: velocity and activations after it.
-        qacc: acceleration in it.
+        qvel, act: velocity and activations after them.
+        qacc: acceleration in them.
         normal: derivative of the guard's distance.
         rate: see `guards.relaxation_rate`.
         deep: as in `guards.Guards`.
     """
 
-    qvel: Float[Array, "*case nv"]
-    act: Float[Array, "*case na"]
-    qacc: Float[Array, "*case nv"]
-    normal: Float[Array, "*case nv"]
-    rate: Float[Array, "*case"]
-    deep: Bool[Array, "*case"]
+    qvel: Float[Array, "*cases 2 nv"]
+    act: Float[Array, "*cases 2 na"]
+    qacc: Float[Array, "*cases 2 nv"]
+    normal: Float[Array, "*cases nv"]
+    rate: Float[Array, "*cases"]
+    deep: Bool[Array, "*cases"]
 
 
-def passage(
+def passages(
     solver: constraint.Solver,
     model: mjx.Model,
     template: mjx.Data,
@@ -351,36 +357,41 @@ def passage(
     qvel: Qvel,
     act: Act,
     control: Control,
-    warmstart: Qvel,
+    warmstart: Float[Array, "2 nv"],
     event: Events,
-    off: Scalar,
-) -> Passage:
-    """The step from a touch at `qpos`, with the rows of the event's guard, or without if `off` is 1.
+) -> Passages:
+    """The steps from a touch at `qpos`, with the rows of the event's guard and without.
 
-    The guard moves at velocity `closing`; velocity, activation, control and warm start are those of the step.
+    The guard moves at velocity `closing`; velocity, activation and control are those of the step. Each of the two
+    steps has its warm start.
     """
     positioned = fwd_position(model, template.replace(qpos=qpos))
     guard = guard_at(model, positioned, closing, event)
     rows: Any = positioned._impl
-    forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
-    prepared = guards.at_first_touch(model, forced, guard.touching)
-    prepared = guards.without(prepared, guard.absent + off * guard.members)
-    qacc = solver(model, prepared)
+    forced = force_stage(model, positioned, qvel, act, control)
+    touching = guards.at_first_touch(model, forced, guard.touching)
+
+    def step(removed: Rows, warmstart: Qvel) -> tuple[Qvel, Act, Qvel]:
+        prepared = guards.without(touching, removed)
+        qacc = solver(model, prepared.replace(qacc_warmstart=warmstart))
+        return *advance_velocity(model, prepared, qacc), qacc
+
+    on, off = step(guard.absent, warmstart[0]), step(guard.absent + guard.members, warmstart[1])
+    qvel, act, qacc = (jnp.stack(each) for each in zip(on, off, strict=True))
     rate = guards.relaxation_rate(model, positioned.replace(qvel=closing), guard.weights)
-    after, activation = advance_velocity(model, prepared, qacc)
-    return Passage(after, activation, qacc, guard.weights @ rows.efc_J, rate, guard.deep)
+    return Passages(qvel, act, qacc, guard.weights @ rows.efc_J, rate, guard.deep)
 
 
-def least_travel(model: mjx.Model, found: Passage, ends: Bool[Array, ""]) -> Scalar:
+def least_travel(model: mjx.Model, found: Passages, ends: Bool[Array, ""]) -> Scalar:
     """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
 
     Args:
         found: steps with the contact and without.
         ends: whether it ends.
     """
-    on, off = jnp.abs(found.qacc @ found.normal[0])
-    fastest = jnp.where(ends | found.deep[0], jnp.maximum(on, off), off)
-    return model.opt.timestep * fastest / found.rate[0]
+    on, off = jnp.abs(found.qacc @ found.normal)
+    fastest = jnp.where(ends | found.deep, jnp.maximum(on, off), off)
+    return model.opt.timestep * fastest / found.rate
 
 
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
