@@ -38,12 +38,14 @@ from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
 from mjx_study.graph.derivative_rule import flat_with_rule, instantiated, refusing, with_rule
-from mjx_study.graph.scalars import traced_part
+from mjx_study.graph.native import native_identity
+from mjx_study.graph.scalars import traced_part, unrolled
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Rows, Scalar
@@ -72,7 +74,9 @@ from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Changes, Events, OnsetCounts, Past, Touch, at_touch, changes, events_of
 
 SLOTS: Final = 32
-"""Number of events corrected per rollout; later ones are only counted."""
+"""Minimum number of slots of a rollout for events to correct; later events are only counted."""
+SLOTS_PER_GUARD: Final = 8
+"""Slots per contact or limit of the scene."""
 TOGETHER: Final = 8
 """Number of events that an accelerator computes in the time of one."""
 
@@ -93,7 +97,7 @@ def corrected_rollout(
     start: State,
     control_law: ControlLaw,
     horizon: int,
-    slots: int = SLOTS,
+    slots: int | None = None,
     weight: float | Scalar = 1.0,
 ) -> tuple[State, Controls, Float[Array, " horizon"], OnsetCounts]:
     """`dynamics.rollout` with the same values, but derivatives that include the onset term; see `corrected`."""
@@ -110,7 +114,7 @@ def corrected(
     control_law: ControlLaw,
     inputs: Any,
     running_cost: RunningCost,
-    slots: int = SLOTS,
+    slots: int | None = None,
     weight: float | Scalar = 1.0,
 ) -> tuple[State, tuple[State, Controls, Float[Array, " horizon"], Any], OnsetCounts]:
     """`dynamics.simulated` with the same values, but derivatives that include the onset term.
@@ -119,13 +123,14 @@ def corrected(
 
     Args:
         model: the model to step; may be traced, but not differentiated (TypeError).
-        slots: maximum number of events to correct, earliest first.
+        slots: maximum number of events to correct, earliest first; by default `slots_for` the scene.
         weight: factor of the term; 0 gives the derivatives of `dynamics.simulated`.
     """
     if not guards.num_guards(scene.template):
         found = simulated(scene, model, start, control_law, inputs, running_cost)
         return *found, OnsetCounts.none(start.qpos.dtype)
     model = without_derivative(model)
+    slots = slots_for(scene, len(jax.tree.leaves(inputs)[0])) if slots is None else slots
 
     def observe(carry: tuple[State, Past], given: Any):
         state, past = carry
@@ -143,7 +148,7 @@ def corrected(
     like = jax.eval_shape(course, jax.tree.map(lambda leaf: leaf[0], inputs))
     (last, past), known = jax.lax.scan(observe, (begin, Past.none(like)), inputs)
     before, controls, after, residuals, costs, found = known
-    terms, counts = _corrections(scene, model, before, controls, found, past, slots)
+    terms, counts = _corrections(scene, model, before, controls, after, found, past, slots)
     spread, shift, slope = jax.lax.stop_gradient((weight * terms.spread, weight * terms.shift, terms.slope))
 
     def follow(state: State, known):
@@ -163,6 +168,11 @@ def corrected(
     known = inputs, before, (controls, costs), after, own
     moving, (states, controls, costs) = jax.lax.scan(follow, start, known)
     return _moving(last, moving), (states, controls, residuals, costs), counts
+
+
+def slots_for(scene: Scene, horizon: int) -> int:
+    """Number of events that can be corrected in a rollout; each slot takes memory and time, filled or not."""
+    return max(SLOTS, min(SLOTS_PER_GUARD * guards.num_guards(scene.template), horizon))
 
 
 def _observed(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Control, past: Past):
@@ -206,17 +216,28 @@ class Terms(NamedTuple):
 
 
 def _corrections(
-    scene: Scene, model: mjx.Model, before: State, controls: Controls, found: Changes, past: Past, slots: int
+    scene: Scene,
+    model: mjx.Model,
+    before: State,
+    controls: Controls,
+    after: State,
+    found: Changes,
+    past: Past,
+    slots: int,
 ) -> tuple[Terms, OnsetCounts]:
     """Terms of the events, and counts."""
     events = events_of(found, slots)
 
     def term(event: Events):
         pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
-        states, inputs = jax.tree.map(pick, before), pick(controls)
-        if model.nv > MOST_UNROLLED:  # in several graphs
-            return onset_term(with_solver, model, scene.template, states, inputs, event)
-        return entry_by_entry(partial(onset_term, with_run_solver), model, scene.template, states, inputs, event)
+        qpos, qvel, act, inputs, solved = map(pick, (before.qpos, before.qvel, before.act, controls, after.warmstart))
+        states = State(qpos, qvel, act, jnp.where(event.ends, solved[::-1], solved))
+        given, in_parts = (model, scene.template, states, inputs, event), partial(onset_term, with_solver)
+        if model.nv <= MOST_UNROLLED:
+            return entry_by_entry(partial(onset_term, with_run_solver), *given)
+        if native_identity() is None or isinstance(model.body_mass, Tracer):
+            return in_parts(*given)
+        return unrolled(partial(onset_term, with_newton), *given, otherwise=in_parts)
 
     def fill(_: None, some: Events):
         """Terms of a few events; a loop, which ends at once where no sample has any."""
@@ -258,6 +279,7 @@ def onset_term(
         call: how to evaluate the parts, functions of a solver, the model and arrays: `with_solver`, or plainly.
         template: everything but the position.
         states, controls: velocities and activations before steps k and k - 1, and their controls; or of k for both.
+            The warm starts are those of steps with the contact and without.
         event: the contact or limit, and whether it ends.
         moving: leaves of the model that change.
     """
@@ -267,7 +289,7 @@ def onset_term(
     found: list[Passages] = []
     for at in range(len(states.qvel)):
         # the solution of one case is close to that of the other
-        warmstart = found[-1].qacc if found else jnp.tile(states.warmstart[0], (2, 1))
+        warmstart = found[-1].qacc if found else states.warmstart
         before = states.qvel[at], states.act[at], controls[at], warmstart
         found.append(call(passages, model, template, touch.qpos, qvel, *before, event))
     jumps = [each.qvel[0] - each.qvel[1] for each in found]
@@ -287,6 +309,11 @@ def onset_term(
 def with_run_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
     """Evaluate `function(solver, model, *arguments)` in MJX's operations."""
     return function(constraint.run_solver, model, *arguments)
+
+
+def with_newton(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
+    """The same with Newton's method, for native code."""
+    return function(constraint.newton, model, *arguments)
 
 
 def _slope_over(
