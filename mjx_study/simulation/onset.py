@@ -240,10 +240,13 @@ def _corrections(
         return unrolled(partial(onset_term, with_newton), *given, otherwise=in_parts)
 
     def fill(_: None, some: Events):
-        """Terms of a few events; a loop, which ends at once where no sample has any."""
+        """Terms of a few events; a loop, which ends at once where no sample has any.
+
+        It carries the events, and clears them, since what depends on nothing that changes is computed before it.
+        """
         none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(every, some))
-        once = lambda carry: (jnp.zeros((), bool), every(some))  # noqa: E731
-        return None, jax.lax.while_loop(lambda carry: carry[0], once, (jnp.any(some.used), none))[1]
+        once = lambda carry: (jnp.zeros((), bool), jax.tree.map(jnp.zeros_like, carry[1]), every(carry[1]))  # noqa: E731
+        return None, jax.lax.while_loop(lambda carry: carry[0], once, (jnp.any(some.used), some, none))[2]
 
     every, few = (term, ()) if jax.default_backend() == "cpu" else (jax.vmap(term), (TOGETHER,))
     slots = len(events.used)
