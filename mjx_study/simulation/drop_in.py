@@ -223,8 +223,7 @@ def _step_terms(
     crossing = crossings(here, preceding.course, model.opt.timestep)
     ends = existed & preceding.course.pushes & (~active | crossing.ends)
     begins = crossing.begins | (active & ~existed)
-    warmstart = jnp.tile(data.qacc_warmstart, (2, 1))
-    states = State(data.qpos[None], data.qvel[None], data.act[None], warmstart)
+    states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
 
     def add(carry):
         left, *sums = carry

@@ -282,7 +282,7 @@ def onset_term(
         call: how to evaluate the parts, functions of a solver, the model and arrays: `with_solver`, or plainly.
         template: everything but the position.
         states, controls: velocities and activations before steps k and k - 1, and their controls; or of k for both.
-            The warm starts are those of steps with the contact and without.
+            The warm starts are those of steps with the contact and without, or one for both.
         event: the contact or limit, and whether it ends.
         moving: leaves of the model that change.
     """
@@ -292,7 +292,7 @@ def onset_term(
     found: list[Passages] = []
     for at in range(len(states.qvel)):
         # the solution of one case is close to that of the other
-        warmstart = found[-1].qacc if found else states.warmstart
+        warmstart = found[-1].qacc if found else jnp.broadcast_to(states.warmstart, (2, len(qvel)))
         before = states.qvel[at], states.act[at], controls[at], warmstart
         found.append(call(passages, model, template, touch.qpos, qvel, *before, event))
     jumps = [each.qvel[0] - each.qvel[1] for each in found]
