@@ -3,17 +3,22 @@
 python -m experiments.onset            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
 python -m experiments.onset tennis     # means along four directions of the gains; an hour on one core
 python -m experiments.onset rule       # error of the linear term over the onset strength, 11 contact laws
+python -m experiments.onset cost       # time of gradients with the linear term over that without; three minutes
 """
 
 import sys
+import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from estimators import NOISES, first_order, zeroth_order
+from experiments import DOCS
 from experiments.atlas.design import task_of
-from experiments.pages import markdown_row
+from experiments.pages import markdown_row, write_tables
+from experiments.quadruped import walk
+from experiments.timing import interleaved
 from mjx_study.experiment.quadrature import Line, Means, grid, means
 from mjx_study.experiment.resolution import direction_of
 from mjx_study.experiment.tally import onset_numbers
@@ -31,6 +36,7 @@ TIMESTEPS = (0.004, 0.002, 0.001, 0.0005)
 POINTS = 20_000
 CHUNK = 1000
 DIRECTIONS, SAMPLES, PAIRS, REACHES = 4, 20_000, 40_000, (0.01, 0.02, 0.04)  # of tennis
+TIMED, SAMPLES_AT_ONCE = ("pusher", "ball_wall", "momentum_transfer", "tennis", "sliding_box", "landing"), 201
 LAWS = (
     *(((constant, 1.0), (0.9, 0.95)) for constant in (0.01, 0.02, 0.04)),
     *(((0.02, damping), (0.9, 0.95)) for damping in (0.5, 2.0)),
@@ -117,11 +123,37 @@ def rule() -> None:
     print(f"{len(cases)} cases: {min(cases):.2g} to {max(cases):.2g}, median {np.median(cases):.2g}")
 
 
+def cost() -> None:
+    """Write the ratios of gradients' times, and what the rollouts' events are, in processor time of one device."""
+    tasks = {f"`{name}`": (make_task(name), SAMPLES_AT_ONCE) for name in TIMED} | {"quadruped": (walk(128), 16)}
+    ratios, events = [], []
+    for task, samples in tasks.values():
+        own = task.contact_pair is None
+        contact = None if own else family_model("mujoco_default", task.scene, effective_mass=task.effective_mass)
+        objective = Simulator(task, samples).objective(contact)
+        keys = jax.random.split(jax.random.key(0), samples)
+        calls = {
+            "plain": lambda objective=objective, task=task, keys=keys: objective.differentiate(task.theta, keys),
+            "term": lambda objective=objective, task=task, keys=keys: objective.differentiate_corrected(
+                task.theta, keys
+            ),
+        }
+        found, _, missed, *_ = np.asarray([call() for call in calls.values()][1].events).T
+        taken = interleaved(calls, 15, clock=time.process_time)
+        ratios.append(f"{np.median(taken['term']) / np.median(taken['plain']):.2f}")
+        events.append(f"{np.mean(found):.1f}, {np.max(found):.0f}, {np.mean(missed):.1f}")
+        print(ratios, events, flush=True)
+    rows = markdown_row("", *tasks), markdown_row(*["---"] * (1 + len(tasks)))
+    named = ("time with the term over time without", ratios), ("onsets: mean, most, without a term", events)
+    table = [*rows, *(markdown_row(name, *cells) for name, cells in named)]
+    write_tables(DOCS / "onset-correction.md", {"cost": "\n".join(table)})
+
+
 def main() -> None:
     """Run the command line."""
     configure(cpu_devices=1)
     if chosen := sys.argv[1:]:
-        {"tennis": tennis, "rule": rule}[chosen[0]]()
+        {"tennis": tennis, "rule": rule, "cost": cost}[chosen[0]]()
         return
     for name, angles in ANGLES.items():
         found = {onset: measure(make_task(name).replace(onset=onset), angles) for onset in TREATMENTS}

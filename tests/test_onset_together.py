@@ -19,7 +19,7 @@ from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import advance_velocity, force_stage, initial_state, position_stage, rollout
-from mjx_study.simulation.onset import corrected_rollout, passage
+from mjx_study.simulation.onset import corrected_rollout, passages
 from mjx_study.simulation.touch import Crossings, Events, replaced_points
 from tests.scenes import floor_scene, option, scene_of
 from tests.test_onset_term import LAW, compiled
@@ -120,10 +120,8 @@ def test_jumps_of_a_step_add_up_whatever_their_order() -> None:
 
         def jump(guard):
             event = Events(jnp.zeros((), int), guard, ~begins[guard], no, *crossing.others(guard), ~no)
-            at = scene.template.qpos, qvel, qvel, jnp.zeros(0), jnp.zeros(0), jnp.zeros_like(qvel), event
-            on, off = (
-                passage(constraint.run_solver, model, scene.template, *at, each).qvel for each in jnp.arange(2.0)
-            )
+            at = scene.template.qpos, qvel, qvel, jnp.zeros(0), jnp.zeros(0), jnp.zeros((2, 3)), event
+            on, off = passages(constraint.run_solver, model, scene.template, *at).qvel
             return jnp.where(begins[guard], 1.0, -1.0) * (on - off)
 
         def velocity(kept):
@@ -214,4 +212,5 @@ def test_corners_that_replace_each_other_are_counted(second: list[float], begins
     points = guards.Points(place, jnp.full((2, 2), 0.01), jnp.tile(jnp.array([0, 1]), (2, 2, 1)))
     course = guards.Course(touching, touching, touching, touching, touching < 0, points)
     crossing = none.at[1, 1:].set(np.arange(2) == begins)  # the first guard is a limit
-    assert replaced_points(course, Crossings(crossing, none, touching)) == number
+    before, here = (jax.tree.map(lambda leaf, at=at: leaf[at], course) for at in (0, 1))
+    assert replaced_points(here, before, Crossings(crossing[1], none[1], touching[1])) == number

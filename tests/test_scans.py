@@ -60,6 +60,17 @@ def indexed(fixed, start, rows):
     return lax.scan(lambda x, at: (x + table[at] * fixed[0], at), start, jnp.arange(5))
 
 
+def looked_up(fixed, start, rows):
+    """Entries of arrays in memory, and of others, at indices that a loop computes."""
+
+    def sums(x, first):
+        more = lambda carry: (carry[0] + 1, carry[1] + rows[carry[0]] * fixed[carry[0] % 2] - x[carry[0] % 3])  # noqa: E731
+        return lax.while_loop(lambda carry: carry[0] < 5, more, (first, x))[1]
+
+    body = lambda x, row: (0.1 * sums(x, jnp.int32(jnp.abs(4 * row[0])) % 6) + row, rows[jnp.int32(8 * row[1]), 1:])  # noqa: E731
+    return lax.scan(body, start, rows)
+
+
 def stopped(fixed, start, rows):
     """The gradient of a loop with values whose derivative is cut off."""
     inner = lambda x, row: x * lax.stop_gradient(jnp.sin(x)) + row  # noqa: E731
@@ -72,7 +83,7 @@ def nested(fixed, start, rows):
     return jax.jit(lambda start: lax.scan(lambda x, row: (inner(x, row), None), start, rows))(start)
 
 
-LOOPS = {each.__name__: each for each in (several, backward, gradient, indexed, stopped, nested)}
+LOOPS = {each.__name__: each for each in (several, backward, gradient, indexed, looked_up, stopped, nested)}
 
 
 def in_a_batch(function):

@@ -144,6 +144,7 @@ class _Writer:
         self.loads: dict[int, str] = {}
         self._stores: dict[int, list[str]] = {}
         self._names: dict[int, int] = {}
+        self._places: dict[int, tuple[int, int]] = {}
         self._uses: set[int] = set()
         self._before: list[str] = []
 
@@ -194,6 +195,7 @@ class _Writer:
                 where = f"{place}, {at} + {array.size} * step" if each_pass else f"{place}, {at}"
                 load = f"LOAD_BOOL({where})" if kind == "mask" else f"LOAD({kind}, {where})"
                 found[node.number] = f"{kind} x{node.number} = {load};"
+                self._places[node.number] = place, at
                 self._names[node.number] = node.number
         return found
 
@@ -243,6 +245,12 @@ class _Writer:
                 case "output":
                     (loop,), (place, _) = node.arguments, node.parameters
                     self._names[node.number] = self._names[loop.parameters[0][place].number]
+                case "entry":
+                    index, first = node.arguments
+                    (place, at), kind = self._places[first.number], _type(node.dtype)
+                    where = f"{place}, {at} + {node.parameters} * {self._value(index)}"
+                    line = f"{kind} x{node.number} = ENTRY({kind}, {where});"
+                    found.append(self._statement([line], {node.number: kind}))
                 case "whole":
                     raise NotWrittenError(node.parameters[0].primitive.name)
                 case primitive:

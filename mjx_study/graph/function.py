@@ -60,7 +60,9 @@ class ScalarFunction:
     @cached_property
     def size(self) -> int:
         """Number of operations, those of loops included."""
-        return _size(self.needed)
+        found: set[int] = set()
+        _count(self.needed, found)
+        return len(found)
 
     @cached_property
     def used(self) -> list[int]:
@@ -83,9 +85,12 @@ class ScalarFunction:
         return self.derived[key]
 
 
-def _size(nodes: list[Node]) -> int:
-    loops = [each.parameters for each in nodes if each.operation == "loop"]
-    return len(nodes) + sum(_size(needed_for([*again, *after])) for _, again, after in loops)
+def _count(nodes: list[Node], found: set[int]) -> None:
+    found |= {each.number for each in nodes}
+    for each in nodes:
+        if each.operation == "loop":
+            _, again, after = each.parameters
+            _count(needed_for([*again, *after]), found)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,10 +244,11 @@ def _native(
 ) -> list[np.ndarray]:
     """Write out native code that is called, which is a graph already."""
     outputs = [np.empty((*batch, *aval.shape), object) for aval in function.avals]
+    graph.called += function.size * math.prod(batch)
     for at in np.ndindex(*batch):
         values: dict[int, Any] = {}
         for array, nodes in zip(inputs, function.inputs, strict=True):
-            entries = array[at] if array.ndim > nodes.ndim else array
+            entries = array[(*at, ...)] if array.ndim > nodes.ndim else array
             values |= zip((node.number for node in nodes.flat), entries.flat, strict=True)
         _copy(graph, function.needed, values)
         for every, array in zip(outputs, function.outputs, strict=True):

@@ -46,9 +46,30 @@ def _dynamic_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: An
     array, *starts = inputs
     last = [whole - size for whole, size in zip(array.shape, aval.shape, strict=True)]
     result = array[_window([0] * array.ndim, aval.shape)]
-    for first, here in _cases(graph, _clipped(graph, [each[()] for each in starts], last), last):
+    index = _clipped(graph, [each[()] for each in starts], last)
+    if (found := _in_memory(graph, array, aval, index, last)) is not None:
+        return [found]
+    for first, here in _cases(graph, index, last):
         result = _selected(graph, here, array[_window(first, aval.shape)], result, aval)
     return [result]
+
+
+@no_type_check
+def _in_memory(
+    graph: ScalarGraph, array: np.ndarray, aval: Any, index: Sequence[Any], last: Sequence[Any]
+) -> np.ndarray | None:
+    """Slice of an array in memory, with one computed index; None if it is not."""
+    computed = [dim for dim, at in enumerate(index) if isinstance(at, Node)]
+    if not graph.arrays or len(computed) != 1:
+        return None
+    (dim,) = computed
+    starts = [0 if at is index[dim] else int(at) for at in index]
+    cases = [
+        array[_window([value if at == dim else start for at, start in enumerate(starts)], aval.shape)].flat
+        for value in range(last[dim] + 1)
+    ]
+    found = [graph.entry(index[dim], each) for each in zip(*cases, strict=True)]
+    return None if any(each is None for each in found) else filled(aval.shape, found)
 
 
 @no_type_check

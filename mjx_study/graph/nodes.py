@@ -1,5 +1,6 @@
 """Graphs of scalar operations with constant folding and common subexpression elimination."""
 
+import itertools
 import math
 import typing
 from collections.abc import Callable, Iterable, Sequence
@@ -57,8 +58,9 @@ class TooLargeError(Exception):
 class Node:
     """A scalar that depends on the inputs: an operation, with nodes and NumPy scalars as arguments.
 
-    `operation` is a JAX primitive or "input", "carry" (of a loop), "whole" (an operation on whole arrays), "loop", or
-    "output" (an entry of the result of one of the last two, its only argument). Arguments have lower numbers.
+    `operation` is a JAX primitive or "input", "carry" (of a loop), "whole" (an operation on whole arrays), "loop",
+    "output" (an entry of the result of one of the last two, its only argument), or "entry" (of an input at a computed
+    index; the parameter is how far its entries are apart, the first of them an argument). Arguments have lower numbers.
     """
 
     __slots__ = ("arguments", "dtype", "number", "operation", "parameters")
@@ -75,10 +77,14 @@ class ScalarGraph:
     Attributes:
         most: maximum number of nodes, beyond which new ones raise `TooLargeError`; None for any number.
         values_only: whether calls with a derivative of their own are written out, too, which loses it.
+        arrays: inputs by the numbers of their entries, if computed indices may read them in memory.
+        called: number of operations that come from native code.
     """
 
     def __init__(self, most: int | None, values_only: bool = False):
         self.most, self.values_only, self._count = most, values_only, 0
+        self.arrays: dict[int, int] = {}
+        self.called = 0
         self._known: dict[Any, Node] = {}
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:
@@ -148,6 +154,18 @@ class ScalarGraph:
         spread = [np.broadcast_to(each, aval.shape).flat for each in inputs]
         entries = zip(*spread, strict=True)
         return filled(aval.shape, [self.scalar(primitive, each, aval.dtype, **parameters) for each in entries])
+
+    def entry(self, index: Any, cases: Sequence[Any]) -> Any:
+        """Entry of an array in memory at a computed index within it, given all its possible values.
+
+        None if they are not in memory, at equal distances.
+        """
+        numbers = [each.number if isinstance(each, Node) else 0 for each in cases]
+        places = {self.arrays.get(number) for number in numbers}
+        if None in places or len(places) > 1 or cases[0].dtype == bool:
+            return None
+        apart = {after - before for before, after in itertools.pairwise(numbers)}
+        return self.node("entry", (index, cases[0]), apart.pop(), cases[0].dtype) if len(apart) == 1 else None
 
     def reduced(self, primitive: Any, rows: np.ndarray, aval: Any) -> np.ndarray:
         """Combine entries along the last axis; an empty axis gives zeros."""

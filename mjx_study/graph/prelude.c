@@ -80,6 +80,13 @@ SELECT(u8, i8)
 
 #define LOAD(type, place, at) (*(const type##_anywhere *)(in[place] + (at) * in_step[place]))
 #define STORE(type, place, at, value) (*(type##_anywhere *)(out[place] + (at) * out_step[place]) = (value))
+#define ENTRY(type, place, at)                                                                                        \
+  ({                                                                                                                 \
+    type r;                                                                                                          \
+    EACH memcpy((char *)&r + lane * sizeof(r[0]), in[place] + (at)[lane] * in_step[place] + lane * sizeof(r[0]),       \
+                sizeof(r[0]));                                                                                       \
+    r;                                                                                                               \
+  })
 #define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
 #define STORE_BOOL(place, at, value) STORE(u8, place, at, AS(u8, (value) & 1))
 

@@ -7,6 +7,7 @@ becomes one function whose body is a graph, native code that it calls included.
 
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
+from functools import partial
 from typing import Any, Final
 
 import jax
@@ -20,10 +21,12 @@ from mjx_study.graph.c import NotWrittenError, source_of
 from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, run, scan_inputs
 from mjx_study.graph.native import POSTPONED, NativeFunction, count_left, native_identity, switched_on
 from mjx_study.graph.nodes import ScalarGraph, TooLargeError, constants
+from mjx_study.graph.scalars import most_scalars
 
 MOST_OPERATIONS: Final = 4_000
 """Maximum number of scalar operations in a pass. Longer ones spend their time in the native code that they call, which
-programs share, and registers do not suffice for what surrounds it."""
+programs share, and registers do not suffice for what surrounds it. On CPUs, code called in a loop that carries nothing
+does not count: only vectors of samples for which it has anything to do compute it."""
 MOST_CARRIED: Final = 500
 """Maximum number of scalars from one pass to the next."""
 
@@ -41,15 +44,56 @@ def with_native_scans(function: Callable[..., Any]) -> Callable[..., Any]:
         with switched_on(POSTPONED):
             closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
         leaves, structure = jax.tree.flatten(shape)
+        closed = _without_rules(closed)
         jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(leaves), instantiate=True)
-        outputs = _evaluated(ClosedJaxpr(jaxpr, closed.consts), jax.tree.leaves(arguments))
+        outputs = _evaluated(_natively, ClosedJaxpr(jaxpr, closed.consts), *jax.tree.leaves(arguments))
         return structure.unflatten(outputs)
 
     return program
 
 
-def _evaluated(closed: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
-    """Outputs of a program, with its scans replaced."""
+def _without_rules(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The program with what functions with a derivative rule compute in place of calls of them.
+
+    Nothing is then computed because a derivative might depend on it, and loops that copy their rows need not run.
+    """
+    return jax.make_jaxpr(partial(_evaluated, _inlined, closed))(*closed.in_avals)
+
+
+def _inlined(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
+    """Outputs of an operation without such functions."""
+    name, inner = equation.primitive.name, equation.params.get("jaxpr")
+    if not isinstance(inner, ClosedJaxpr) or not (name == "ruled" or _has(inner.jaxpr, "ruled")):
+        return bind_whole(equation, inputs)
+    if name in ("ruled", "jit", "pjit"):
+        return _evaluated(_inlined, inner, *inputs)
+    if name != "scan":
+        return bind_whole(equation, inputs)
+    body = _without_rules(inner)
+    outputs = list(bind_whole(equation.replace(params={**equation.params, "jaxpr": body}), inputs))
+    *before, rows = scan_inputs(equation, inputs)
+    known = dict(zip(body.jaxpr.invars[sum(map(len, before)) :], rows, strict=True))
+    for place, atom in enumerate(body.jaxpr.outvars):
+        if place >= len(before[1]) and not isinstance(atom, Literal) and atom in known:
+            outputs[place] = known[atom]
+    return outputs
+
+
+def _natively(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
+    """Outputs of an operation, in which scans are replaced by native code."""
+    name, inner = equation.primitive.name, equation.params.get("jaxpr")
+    if name == "scan" and (loop := _native_scan(equation, inputs)) is not None:
+        return loop
+    if name in ("jit", "pjit") and isinstance(inner, ClosedJaxpr) and _has(inner.jaxpr, "scan"):
+        return _evaluated(_natively, inner, *inputs)
+    _build(equation)
+    return bind_whole(equation, inputs)
+
+
+def _evaluated(
+    outputs_of: Callable[[Any, Sequence[Any]], Sequence[Any]], closed: ClosedJaxpr, *inputs: Any
+) -> list[Any]:
+    """Outputs of a program, from those of its operations."""
     jaxpr = closed.jaxpr
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed.consts, *inputs), strict=True))
 
@@ -57,15 +101,7 @@ def _evaluated(closed: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
         return atom.val if isinstance(atom, Literal) else values[atom]
 
     for equation in jaxpr.eqns:
-        given = [read(atom) for atom in equation.invars]
-        inner = equation.params.get("jaxpr")
-        if equation.primitive.name == "scan" and (loop := _native_scan(equation, given)) is not None:
-            outputs = loop
-        elif equation.primitive.name in ("jit", "pjit") and isinstance(inner, ClosedJaxpr) and _scans(inner.jaxpr):
-            outputs = _evaluated(inner, given)
-        else:
-            _build(equation)
-            outputs = bind_whole(equation, given)
+        outputs = outputs_of(equation, [read(atom) for atom in equation.invars])
         values |= zip(equation.outvars, outputs, strict=True)
     return [read(atom) for atom in jaxpr.outvars]
 
@@ -118,7 +154,7 @@ def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
 
 
 def _body(
-    closed: Any, inputs: Sequence[Any], fixed: Sequence[bool], wanted: Sequence[int], carried: Sequence[int]
+    closed: Any, inputs: Sequence[Any], fixed: Sequence[bool], wanted: Sequence[int], carried: range
 ) -> tuple[ScalarFunction, list[int]]:
     """Body of a scan as a graph of some of its outputs, and the places of the inputs that it has.
 
@@ -126,11 +162,14 @@ def _body(
         fixed: whether each input is a constant.
         carried: places of what is carried, which it has in any case.
     """
-    graph = ScalarGraph(2 * MOST_OPERATIONS, values_only=True)
+    most = MOST_OPERATIONS if len(carried) or jax.default_backend() != "cpu" else most_scalars()
+    graph = ScalarGraph(2 * most + sum(aval.size for aval in closed.in_avals), values_only=True)
     given = []
-    for each, known, aval in zip(inputs, fixed, closed.in_avals, strict=True):
+    for place, (each, known, aval) in enumerate(zip(inputs, fixed, closed.in_avals, strict=True)):
         value = each if aval.size else np.zeros(aval.shape, aval.dtype)
         given.append(constants(value) if known else graph.fresh("input", aval.shape, aval.dtype))
+        if not known and place < carried.start:
+            graph.arrays |= dict.fromkeys((node.number for node in given[-1].flat), place)
     outputs = run(graph, closed, given)
     free = [place for place, known in enumerate(fixed) if not known]
     function = ScalarFunction(
@@ -140,7 +179,8 @@ def _body(
         [closed.out_avals[place] for place in wanted],
         None,
     )
-    if function.size > MOST_OPERATIONS or sum(given[place].size for place in carried) > MOST_CARRIED:
+    own, num_carried = function.size - graph.called, sum(given[place].size for place in carried)
+    if function.size > most or own > MOST_OPERATIONS or num_carried > MOST_CARRIED:
         raise TooLargeError
     used = {free[at] for at in function.used}
     places = [place for place in free if place in used or place in carried]
@@ -155,9 +195,9 @@ def _inside(equation: Any) -> list[Jaxpr]:
     return found
 
 
-def _scans(jaxpr: Jaxpr) -> bool:
-    """Whether a program has a scan, in programs that it calls, too."""
-    return any(each.primitive.name == "scan" or any(map(_scans, _inside(each))) for each in jaxpr.eqns)
+def _has(jaxpr: Jaxpr, name: str) -> bool:
+    """Whether a program has an operation, in programs that it calls, too."""
+    return any(each.primitive.name == name or any(_has(own, name) for own in _inside(each)) for each in jaxpr.eqns)
 
 
 def _build(equation: Any) -> None:

@@ -10,7 +10,7 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
 from mjx_study.simulation.dynamics import State, simulated, trajectory
-from mjx_study.simulation.onset import corrected_rollout, without_derivative
+from mjx_study.simulation.onset import corrected, without_derivative
 from mjx_study.simulation.touch import OnsetCounts
 from mjx_study.tasks.task import Task
 
@@ -53,11 +53,11 @@ def rollout_cost(
     first = task.policy.place(theta, noise, start)
     moved, counts, term = (task.scene, model, first, control_law), None, 0.0
     if onset == "linear":
-        states, controls, residuals, counts = corrected_rollout(*moved, task.horizon, inputs=feedforward, weight=weight)
-        costs, last = jax.vmap(running_cost)(before_each_step(states), controls), last_of(states)
+        last, found, counts = corrected(*moved, feedforward, running_cost, weight=weight)
     else:
-        last, (before, controls, residuals, costs) = simulated(*moved, feedforward, running_cost, backward)
-        states = trajectory(before, last)
+        last, found = simulated(*moved, feedforward, running_cost, backward)
+    before, controls, residuals, costs = found
+    states = trajectory(before, last)
     if onset == "jump":
         fixed, each = jax.lax.stop_gradient((theta, feedforward))
         law = lambda index, state: control_law(each[index], state, fixed)  # noqa: E731

@@ -22,13 +22,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mjx_study.simulation import guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Scalar
 from mjx_study.simulation.dynamics import Control, ControlLaw, Controls, State, solved_step, step, with_solver
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import Passage, least_travel, passage
+from mjx_study.simulation.onset import Passages, least_travel, passages
 from mjx_study.simulation.scene import Scene
-from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, find_events
+from mjx_study.simulation.touch import Events, OnsetCounts, Past, at_touch, changes, events_of
 
 SLOTS: Final = 8
 """Number of events with branches of their own per rollout; later ones are only counted."""
@@ -54,7 +55,7 @@ def jump_term(
         slots: maximum number of events to correct, earliest first.
     """
     before, controls = jax.lax.stop_gradient((jax.tree.map(lambda leaf: leaf[:-1], states), controls))
-    if not scene.has_constraints:
+    if not guards.num_guards(scene.template):
         return jnp.zeros_like(before.qpos, shape=()), OnsetCounts.none(before.qpos.dtype)
 
     def cost_to_go(index, state):
@@ -69,7 +70,10 @@ def jump_term(
         return total + final_cost(last)
 
     course = jax.vmap(lambda state, control: solved_step(scene, model, state, control)[-1])(before, controls)
-    events, without = find_events(course, scene.timestep, slots)
+    past = Past.none(jax.tree.map(lambda leaf: leaf[0], course))
+    past, found = jax.lax.scan(lambda past, here: changes(here, past, scene.timestep), past, course)
+    events = events_of(found, slots)
+    slots = len(events.used)
     filled = jnp.sum(events.used)
     weights = jnp.zeros((slots, 2, scene.host.nv), before.qpos.dtype)
     flags = jnp.zeros((slots, 2), bool)
@@ -88,7 +92,7 @@ def jump_term(
         before.qpos[at], states.qpos[at]
     )
     narrow, valid = flags.T
-    return jnp.sum(weights * moved), events.counts(without, valid, narrow, jnp.zeros(slots, weights.dtype))
+    return jnp.sum(weights * moved), events.counts(past, valid, narrow, jnp.zeros(slots, weights.dtype))
 
 
 def _weights(
@@ -101,19 +105,18 @@ def _weights(
     start = integrate_position(host, qpos, -qvel, timestep * touch.share)
 
     def jump(index):
-        state = before.qvel[index], before.act[index], controls[index], before.warmstart[index]
+        state = before.qvel[index], before.act[index], controls[index], jnp.tile(before.warmstart[index], (2, 1))
 
-        def go_on(off):
-            found = with_solver(passage, model, scene.template, touch.qpos, qvel, *state, event, off)
-            after = State(integrate_position(host, start, found.qvel, timestep), found.qvel, found.act, found.qacc)
-            return cost_to_go(index + 1, after), found
+        def go_on(qvel, act, qacc):
+            return cost_to_go(index + 1, State(integrate_position(host, start, qvel, timestep), qvel, act, qacc))
 
-        (on, off), found = jax.vmap(go_on)(jnp.array([0.0, 1.0], qvel.dtype))
+        found = with_solver(passages, model, scene.template, touch.qpos, qvel, *state, event)
+        on, off = jax.vmap(go_on)(found.qvel, found.act, found.qacc)
         return on - off, found
 
     (here, previous), found = jax.vmap(jump)(jnp.stack([event.step, event.step - 1]))
-    first: Passage = jax.tree.map(lambda leaf: leaf[0], found)
-    normal, least = first.normal[0], least_travel(model, first, event.ends)
+    first: Passages = jax.tree.map(lambda leaf: leaf[0], found)
+    normal, least = first.normal, least_travel(model, first, event.ends)
     cell, (last, earlier) = -jnp.maximum(jnp.abs(touch.travel), least), touch.weights
     weights = jnp.stack([last * here, earlier * previous])[:, None] * normal / cell
     return jnp.where(touch.valid, weights, 0.0), jnp.stack([touch.valid & (jnp.abs(touch.travel) < least), touch.valid])

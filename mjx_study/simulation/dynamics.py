@@ -168,10 +168,11 @@ def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Control
 
 def solved_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, guards.Course]:
     """`step` without derivatives, and the course of the guards in it."""
-    return with_solver(partial(_solved_step, scene), model, state, control)
+    return with_solver(partial(observed_step, scene), model, state, control)
 
 
-def _solved_step(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Array):
+def observed_step(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Array):
+    """`solved_step` with a solver, in MJX's operations."""
     after, residual, data = _solved(solver, scene, model, state, control)
     return after, residual, guards.course(model, data, state.qvel, after.qvel, after.warmstart)
 

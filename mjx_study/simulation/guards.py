@@ -38,6 +38,12 @@ class Guards(NamedTuple):
     deep: Bool[Array, " guards"]
 
 
+def num_guards(data: mjx.Data) -> int:
+    """Number of limits and contacts."""
+    rows: Any = data._impl
+    return int(rows.nl) + len(rows.contact.dim)
+
+
 def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
     """Map each guard (limits first, then contacts) to its constraint rows; static, both `(guards, rows)`.
 

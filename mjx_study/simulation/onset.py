@@ -30,19 +30,22 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 (arXiv 2306.06862), for the continuous-time limit.
 """
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
-from mjx_study.graph.derivative_rule import instantiated, refusing, with_rule
-from mjx_study.graph.scalars import traced_part
+from mjx_study.graph.derivative_rule import flat_with_rule, instantiated, refusing, with_rule
+from mjx_study.graph.native import native_identity
+from mjx_study.graph.scalars import traced_part, unrolled
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Rows, Scalar
@@ -53,27 +56,27 @@ from mjx_study.simulation.dynamics import (
     Controls,
     Point,
     Qpos,
+    RunningCost,
     State,
     advance_velocity,
     entry_by_entry,
     force_stage,
     fwd_position,
+    observed_step,
     simulated,
-    solved_step,
     step_change,
     trajectory,
     with_solver,
 )
-from mjx_study.simulation.guards import Course
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED
 from mjx_study.simulation.scene import Scene
-from mjx_study.simulation.touch import Events, OnsetCounts, Touch, at_touch, find_events
+from mjx_study.simulation.touch import Changes, Events, OnsetCounts, Past, Touch, at_touch, changes, events_of
 
 SLOTS: Final = 32
-"""Number of events corrected per rollout; later ones are only counted."""
-PER_STEP: Final = 4
-"""Number of events corrected per step; further ones are only counted."""
+"""Minimum number of slots of a rollout for events to correct; later events are only counted."""
+SLOTS_PER_GUARD: Final = 8
+"""Slots per contact or limit of the scene."""
 TOGETHER: Final = 8
 """Number of events that an accelerator computes in the time of one."""
 
@@ -94,56 +97,92 @@ def corrected_rollout(
     start: State,
     control_law: ControlLaw,
     horizon: int,
-    slots: int = SLOTS,
+    slots: int | None = None,
     weight: float | Scalar = 1.0,
-    inputs: Any = None,
 ) -> tuple[State, Controls, Float[Array, " horizon"], OnsetCounts]:
-    """`dynamics.rollout` with the same values, but derivatives that include the onset term.
+    """`dynamics.rollout` with the same values, but derivatives that include the onset term; see `corrected`."""
+    law = control_law, jnp.arange(horizon)
+    last, found, counts = corrected(scene, model, start, *law, lambda *_: None, slots, weight)
+    states, controls, residuals, _ = found
+    return trajectory(states, last), controls, residuals, counts
+
+
+def corrected(
+    scene: Scene,
+    model: mjx.Model,
+    start: State,
+    control_law: ControlLaw,
+    inputs: Any,
+    running_cost: RunningCost,
+    slots: int | None = None,
+    weight: float | Scalar = 1.0,
+) -> tuple[State, tuple[State, Controls, Float[Array, " horizon"], Any], OnsetCounts]:
+    """`dynamics.simulated` with the same values, but derivatives that include the onset term.
 
     First derivatives with respect to initial state and controls, in forward and reverse mode.
 
     Args:
         model: the model to step; may be traced, but not differentiated (TypeError).
-        slots: maximum number of events to correct, earliest first.
-        weight: factor of the term; 0 gives the derivatives of `dynamics.rollout`.
-        inputs: inputs of the control law, as for `dynamics.simulated`; None for the steps' indices.
+        slots: maximum number of events to correct, earliest first; by default `slots_for` the scene.
+        weight: factor of the term; 0 gives the derivatives of `dynamics.simulated`.
     """
-    inputs = jnp.arange(horizon) if inputs is None else inputs
-    if not scene.has_constraints:
-        last, (states, controls, residuals, _) = simulated(scene, model, start, control_law, inputs, lambda *_: None)
-        return trajectory(states, last), controls, residuals, OnsetCounts.none(start.qpos.dtype)
+    if not guards.num_guards(scene.template):
+        found = simulated(scene, model, start, control_law, inputs, running_cost)
+        return *found, OnsetCounts.none(start.qpos.dtype)
     model = without_derivative(model)
+    slots = slots_for(scene, len(jax.tree.leaves(inputs)[0])) if slots is None else slots
 
-    def observe(state: State, given: Any):
-        control = jax.lax.stop_gradient(control_law(given, state))
-        following, residual, course = solved_step(scene, model, state, control)
-        return following, (state, control, following, residual, course)
+    def observe(carry: tuple[State, Past], given: Any):
+        state, past = carry
+        control, cost = jax.lax.stop_gradient(acted(given, state))
+        following, residual, past, found = with_solver(partial(_observed, scene), model, state, control, past)
+        return (following, past), (state, control, following, residual, cost, found)
 
-    _, (before, controls, after, residuals, course) = jax.lax.scan(observe, jax.lax.stop_gradient(start), inputs)
-    terms, first, counts = _corrections(scene, model, before, controls, course, slots)
+    def acted(given: Any, state: State):
+        control = control_law(given, state)
+        return control, running_cost(state, control)
 
-    rows = jnp.arange(min(PER_STEP, slots, course.distance.shape[1]))
+    begin = jax.lax.stop_gradient(start)
+    step = partial(observed_step, scene, constraint.run_solver, model)
+    course = lambda given: step(begin, control_law(given, begin))[2]  # noqa: E731
+    like = jax.eval_shape(course, jax.tree.map(lambda leaf: leaf[0], inputs))
+    (last, past), known = jax.lax.scan(observe, (begin, Past.none(like)), inputs)
+    before, controls, after, residuals, costs, found = known
+    terms, counts = _corrections(scene, model, before, controls, after, found, past, slots)
+    spread, shift, slope = jax.lax.stop_gradient((weight * terms.spread, weight * terms.shift, terms.slope))
 
     def follow(state: State, known):
-        given, fixed, after, (first, following) = known
-        control = control_law(given, state)
-        own, used = jnp.minimum(first + rows, max(slots - 1, 0)), (first + rows < following)[:, None]
-        spread, shift, slope = (jnp.where(used, leaf[own], 0) for leaf in terms)
+        given, fixed, values, after, own = known
+        state = _moving(fixed, state)
+        control, cost = _moving(values, acted(given, state))
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
-        velocity = tangent_along(shift, slope, moved - scene.timestep * state.qvel)
-        qpos = integrate_position(scene.host, state.qpos, velocity, scene.timestep)
-        qvel, act = _known_step(scene, model, (qpos, state.qvel + velocity, state.act, control), after)
-        qvel = qvel + tangent_along(spread, slope, moved)
+        velocity = tangent_of(along_events(shift, slope, own, moved - scene.timestep * state.qvel))
+        shifted = integrate_position(scene.host, state.qpos, velocity, scene.timestep), state.qvel + velocity
+        qpos, qvel = _moving((fixed.qpos, fixed.qvel), shifted)
+        qvel, act = _known_step(scene, model, (qpos, qvel, state.act, control), after)
+        qvel = qvel + tangent_of(along_events(spread, slope, own, moved))
         following = State(integrate_position(scene.host, qpos, qvel, scene.timestep), qvel, act, after.warmstart)
-        return following, (following, control)
+        return following, (state, control, cost)
 
-    terms = terms._replace(spread=weight * terms.spread, shift=weight * terms.shift)
-    _, (states, over_controls) = jax.lax.scan(follow, start, (inputs, before, after, (first[:-1], first[1:])))
-    states, controls = jax.tree.map(
-        lambda known, each: known + tangent_of(each), (after, controls), (states, over_controls)
-    )
-    whole = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
-    return whole, controls, residuals, counts
+    own = jnp.minimum(found.before, slots), jnp.minimum(found.after, slots)
+    known = inputs, before, (controls, costs), after, own
+    moving, (states, controls, costs) = jax.lax.scan(follow, start, known)
+    return _moving(last, moving), (states, controls, residuals, costs), counts
+
+
+def slots_for(scene: Scene, horizon: int) -> int:
+    """Number of events that can be corrected in a rollout; each slot takes memory and time, filled or not."""
+    return max(SLOTS, min(SLOTS_PER_GUARD * guards.num_guards(scene.template), horizon))
+
+
+def _observed(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Control, past: Past):
+    after, residual, course = observed_step(scene, solver, model, state, control)
+    return after, residual, *changes(course, past, scene.timestep)
+
+
+def _moving(known: Any, moving: Any) -> Any:
+    """Known values, with the derivatives of others."""
+    return jax.tree.map(_with_tangent, known, moving)
 
 
 def _known_step(scene: Scene, model: mjx.Model, point: Point, after: State) -> tuple[Qvel, Act]:
@@ -177,34 +216,45 @@ class Terms(NamedTuple):
 
 
 def _corrections(
-    scene: Scene, model: mjx.Model, before: State, controls: Controls, course: Course, slots: int
-) -> tuple[Terms, Int[Array, " horizon_and_1"], OnsetCounts]:
-    """Terms of the events, the first event of every step, and counts."""
-    events, without = find_events(course, scene.timestep, slots, PER_STEP)
+    scene: Scene,
+    model: mjx.Model,
+    before: State,
+    controls: Controls,
+    after: State,
+    found: Changes,
+    past: Past,
+    slots: int,
+) -> tuple[Terms, OnsetCounts]:
+    """Terms of the events, and counts."""
+    events = events_of(found, slots)
 
     def term(event: Events):
         pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
-        states, inputs = jax.tree.map(pick, before), pick(controls)
-        if model.nv > MOST_UNROLLED:  # in several graphs
-            return onset_term(with_solver, model, scene.template, states, inputs, event)
-        return entry_by_entry(partial(onset_term, with_run_solver), model, scene.template, states, inputs, event)
+        qpos, qvel, act, inputs, solved = map(pick, (before.qpos, before.qvel, before.act, controls, after.warmstart))
+        states = State(qpos, qvel, act, jnp.where(event.ends, solved[::-1], solved))
+        given, in_parts = (model, scene.template, states, inputs, event), partial(onset_term, with_solver)
+        if model.nv <= MOST_UNROLLED:
+            return entry_by_entry(partial(onset_term, with_run_solver), *given)
+        if native_identity() is None or isinstance(model.body_mass, Tracer):
+            return in_parts(*given)
+        return unrolled(partial(onset_term, with_newton), *given, otherwise=in_parts)
 
-    def fill(carry):
-        slot, found = carry
-        some = jnp.minimum(slot + jnp.arange(together), slots - 1)
-        more = jax.vmap(term)(jax.tree.map(lambda leaf: leaf[some], events))
-        return slot + together, jax.tree.map(lambda every, one: every.at[some].set(one), found, more)
+    def fill(_: None, some: Events):
+        """Terms of a few events; a loop, which ends at once where no sample has any.
 
-    together = 1 if jax.default_backend() == "cpu" else min(TOGETHER, slots)
-    filled, dtype = jnp.sum(events.used), course.distance.dtype
-    vector, flag = jnp.zeros((max(slots, 1), scene.host.nv), dtype), jnp.zeros(slots, bool)
-    found = Terms(vector, vector, vector), jnp.zeros(slots, dtype), flag, flag
-    if slots:  # not a scan: the loop over a batch ends with the last event of any rollout
-        _, found = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, (jnp.zeros_like(filled), found))
-    terms, strength, narrow, valid = found
-    starts = jnp.arange(len(before.qpos) + 1)
-    first = jnp.sum(jnp.where(events.used, events.step, len(starts)) < starts[:, None], axis=1)
-    return terms, first, events.counts(without, valid, narrow, strength)
+        It carries the events, and clears them, since what depends on nothing that changes is computed before it.
+        """
+        none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(every, some))
+        once = lambda carry: (jnp.zeros((), bool), jax.tree.map(jnp.zeros_like, carry[1]), every(carry[1]))  # noqa: E731
+        return None, jax.lax.while_loop(lambda carry: carry[0], once, (jnp.any(some.used), some, none))[2]
+
+    every, few = (term, ()) if jax.default_backend() == "cpu" else (jax.vmap(term), (TOGETHER,))
+    slots = len(events.used)
+    grouped = jax.tree.map(lambda leaf: jnp.resize(leaf, (-(-slots // math.prod(few)), *few, *leaf.shape[1:])), events)
+    _, each = jax.lax.scan(fill, None, grouped)
+    flat = lambda leaf: leaf.reshape(-1, *leaf.shape[1 + len(few) :])[:slots]  # noqa: E731
+    terms, strength, narrow, valid = jax.tree.map(flat, each)
+    return terms, events.counts(past, valid, narrow, strength)
 
 
 Moving = Mapping[int, Array]
@@ -232,19 +282,21 @@ def onset_term(
         call: how to evaluate the parts, functions of a solver, the model and arrays: `with_solver`, or plainly.
         template: everything but the position.
         states, controls: velocities and activations before steps k and k - 1, and their controls; or of k for both.
+            The warm starts are those of steps with the contact and without, or one for both.
         event: the contact or limit, and whether it ends.
         moving: leaves of the model that change.
     """
     qpos, qvel = states.qpos[0], states.qvel[0]
     touch: Touch = call(at_touch, model, template, qpos, qvel, event)
 
-    def both(*before):
-        each = lambda off: call(passage, model, template, touch.qpos, qvel, *before, event, off)  # noqa: E731
-        return jax.vmap(each)(jnp.array([0.0, 1.0], qvel.dtype))
-
-    found: Passage = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
-    jumps, first = found.qvel[:, 0] - found.qvel[:, 1], jax.tree.map(lambda leaf: leaf[0], found)
-    least, normal = least_travel(model, first, event.ends), first.normal[0]
+    found: list[Passages] = []
+    for at in range(len(states.qvel)):
+        # the solution of one case is close to that of the other
+        warmstart = found[-1].qacc if found else jnp.broadcast_to(states.warmstart, (2, len(qvel)))
+        before = states.qvel[at], states.act[at], controls[at], warmstart
+        found.append(call(passages, model, template, touch.qpos, qvel, *before, event))
+    jumps = [each.qvel[0] - each.qvel[1] for each in found]
+    least, normal = least_travel(model, found[0], event.ends), found[0].normal
     cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
     last, before = touch.weights
     slope = normal
@@ -260,6 +312,11 @@ def onset_term(
 def with_run_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
     """Evaluate `function(solver, model, *arguments)` in MJX's operations."""
     return function(constraint.run_solver, model, *arguments)
+
+
+def with_newton(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
+    """The same with Newton's method, for native code."""
+    return function(constraint.newton, model, *arguments)
 
 
 def _slope_over(
@@ -302,26 +359,26 @@ def guard_at(model: mjx.Model, positioned: mjx.Data, qvel: Qvel, event: Events) 
     return GuardAtTouch(weights, deep, members[event.guard], absent, touching)
 
 
-class Passage(NamedTuple):
-    """A step from the touch of a guard, with its rows on or off; or two, with them on and off.
+class Passages(NamedTuple):
+    """Two steps from the touch of a guard, first with its rows on, then with them off.
 
     Attributes:
-        qvel, act: velocity and activations after it.
-        qacc: acceleration in it.
+        qvel, act: velocity and activations after them.
+        qacc: acceleration in them.
         normal: derivative of the guard's distance.
         rate: see `guards.relaxation_rate`.
         deep: as in `guards.Guards`.
     """
 
-    qvel: Float[Array, "*case nv"]
-    act: Float[Array, "*case na"]
-    qacc: Float[Array, "*case nv"]
-    normal: Float[Array, "*case nv"]
-    rate: Float[Array, "*case"]
-    deep: Bool[Array, "*case"]
+    qvel: Float[Array, "*cases 2 nv"]
+    act: Float[Array, "*cases 2 na"]
+    qacc: Float[Array, "*cases 2 nv"]
+    normal: Float[Array, "*cases nv"]
+    rate: Float[Array, "*cases"]
+    deep: Bool[Array, "*cases"]
 
 
-def passage(
+def passages(
     solver: constraint.Solver,
     model: mjx.Model,
     template: mjx.Data,
@@ -330,55 +387,85 @@ def passage(
     qvel: Qvel,
     act: Act,
     control: Control,
-    warmstart: Qvel,
+    warmstart: Float[Array, "2 nv"],
     event: Events,
-    off: Scalar,
-) -> Passage:
-    """The step from a touch at `qpos`, with the rows of the event's guard, or without if `off` is 1.
+) -> Passages:
+    """The steps from a touch at `qpos`, with the rows of the event's guard and without.
 
-    The guard moves at velocity `closing`; velocity, activation, control and warm start are those of the step.
+    The guard moves at velocity `closing`; velocity, activation and control are those of the step. Each of the two
+    steps has its warm start.
     """
     positioned = fwd_position(model, template.replace(qpos=qpos))
     guard = guard_at(model, positioned, closing, event)
     rows: Any = positioned._impl
-    forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
-    prepared = guards.at_first_touch(model, forced, guard.touching)
-    prepared = guards.without(prepared, guard.absent + off * guard.members)
-    qacc = solver(model, prepared)
+    forced = force_stage(model, positioned, qvel, act, control)
+    touching = guards.at_first_touch(model, forced, guard.touching)
+
+    def step(removed: Rows, warmstart: Qvel) -> tuple[Qvel, Act, Qvel]:
+        prepared = guards.without(touching, removed)
+        qacc = solver(model, prepared.replace(qacc_warmstart=warmstart))
+        return *advance_velocity(model, prepared, qacc), qacc
+
+    on, off = step(guard.absent, warmstart[0]), step(guard.absent + guard.members, warmstart[1])
+    qvel, act, qacc = (jnp.stack(each) for each in zip(on, off, strict=True))
     rate = guards.relaxation_rate(model, positioned.replace(qvel=closing), guard.weights)
-    after, activation = advance_velocity(model, prepared, qacc)
-    return Passage(after, activation, qacc, guard.weights @ rows.efc_J, rate, guard.deep)
+    return Passages(qvel, act, qacc, guard.weights @ rows.efc_J, rate, guard.deep)
 
 
-def least_travel(model: mjx.Model, found: Passage, ends: Bool[Array, ""]) -> Scalar:
+def least_travel(model: mjx.Model, found: Passages, ends: Bool[Array, ""]) -> Scalar:
     """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
 
     Args:
         found: steps with the contact and without.
         ends: whether it ends.
     """
-    on, off = jnp.abs(found.qacc @ found.normal[0])
-    fastest = jnp.where(ends | found.deep[0], jnp.maximum(on, off), off)
-    return model.opt.timestep * fastest / found.rate[0]
+    on, off = jnp.abs(found.qacc @ found.normal)
+    fastest = jnp.where(ends | found.deep, jnp.maximum(on, off), off)
+    return model.opt.timestep * fastest / found.rate
 
 
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
     """Zero, with the derivative of `value`; differentiating it again raises TypeError."""
-    return _tangent_of(value)
+    return _with_tangent(jnp.zeros_like(value), value)
 
 
-_tangent_of = with_rule(
-    jnp.zeros_like, lambda primals, changes: (_tangent_of(differentiated_once(*primals)), changes[0])
-)
+def _of_second(primals: Any, changes: Any) -> Any:
+    return _with_tangent(primals[0], differentiated_once(primals[1])), changes[1]
+
+
+_with_tangent = with_rule(lambda value, moving: value, _of_second)
+"""A value without its own derivative, with that of another; differentiating it again raises TypeError."""
 differentiated_once = refusing("derivatives with the onset term are of first order: it has no second derivative")
 
 
-def tangent_along(
-    jumps: Float[Array, "events nv"], slopes: Float[Array, "events nv"], moved: Float[Array, " nv"]
+def along_events(
+    jumps: Float[Array, "slots nv"],
+    slopes: Float[Array, "slots nv"],
+    own: tuple[Int[Array, ""], Int[Array, ""]],
+    moved: Float[Array, " nv"],
 ) -> Float[Array, " nv"]:
-    """Zero, whose derivative is the sum of the jumps times the slopes' products with that of the motion."""
-    jumps, slopes = jax.lax.stop_gradient((jumps, slopes))
-    return tangent_of(product(jumps.T, product(slopes, moved)))
+    """Sum of some events' jumps times their slopes' products with a motion, linear in the latter.
+
+    Args:
+        own: the first of the events, and the one after the last.
+    """
+
+    def total(jumps: Array, slopes: Array, first: Array, last: Array, moved: Array) -> list[Array]:
+        add = lambda carry: (carry[0] + 1, carry[1] + jumps[carry[0]] * jnp.sum(slopes[carry[0]] * moved))  # noqa: E731
+        return [jax.lax.while_loop(lambda carry: carry[0] < last, add, (first, jnp.zeros_like(moved)))[1]]
+
+    def rule(primals: Sequence[Any], changes: Sequence[Any]) -> Any:
+        return linear(*primals), linear(*primals[:-1], changes[-1])
+
+    def transpose(fixed: Sequence[Any], adjoints: Sequence[Any]) -> list[Any]:
+        jumps, slopes, first, last, _ = fixed
+        return [*[None] * 4, along_events(slopes, jumps, (first, last), adjoints[0])]
+
+    def linear(*arguments: Array) -> list[Array]:
+        return flat_with_rule(total, arguments, rule, transpose)
+
+    (found,) = linear(jumps, slopes, *own, moved)
+    return found
 
 
 def without_derivative(model: mjx.Model) -> mjx.Model:

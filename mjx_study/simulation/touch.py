@@ -6,10 +6,9 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Int8, Int32
 
 from estimators.pytree import register_pytree
-from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qpos, Qvel, Scalar, fwd_position
 from mjx_study.simulation.guards import Course, motion
@@ -78,48 +77,98 @@ class Events:
 
     def counts(
         self,
-        without: tuple[Int[Array, ""], Int[Array, ""]],
+        past: "Past",
         valid: Flags,
         narrow: Flags,
         strength: Float[Array, " slots"],
     ) -> OnsetCounts:
-        """Counts of a rollout, from the numbers of events without a term and from what the term says of the others."""
-        missed, replaced = without
+        """Counts of a rollout, from what is known at its end and from what the term says of these events."""
+        missed = past.events - jnp.sum(self.used)
         begins = valid & ~self.ends
         onsets = jnp.sum(begins)
         first = jnp.min(jnp.where(begins, self.step.astype(strength.dtype), jnp.inf), initial=jnp.inf)
         first = jnp.where(jnp.isinf(first), jnp.nan, first)
         strength = jnp.sqrt(jnp.sum(jnp.where(begins, strength, 0.0) ** 2) / jnp.maximum(onsets, 1))
-        return OnsetCounts(onsets + missed, jnp.sum(narrow), missed, strength, first, replaced)
+        return OnsetCounts(onsets + missed, jnp.sum(narrow), missed, strength, first, past.replaced)
 
 
-def find_events(
-    course: Course, timestep: float | Scalar, slots: int, per_step: int | None = None
-) -> tuple[Events, tuple[Int[Array, ""], Int[Array, ""]]]:
-    """Find where contacts and limits may begin, or end under force (`at_touch` says whether they do).
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class Changes:
+    """What begins and ends in a step, or in the steps of a rollout.
 
-    Also counts those without a slot, and replaced contact points.
+    Attributes:
+        since: as in `Crossings`.
+        kinds: sums of the kinds of change of each guard, of `_KINDS`.
+        before, after: number of events before the step, and with those of the step.
+    """
+
+    since: Float[Array, "*steps guards"]
+    kinds: Int8[Array, "*steps guards"]
+    before: Int32[Array, "*steps"]
+    after: Int32[Array, "*steps"]
+
+
+_KINDS: Final = {"begins": 1, "ends": 2, "happens": 4, "under_force": 8, "brief": 16}
+"""Crossings that begin and end, events, those that end, and those of `Events.brief`."""
+
+
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class Past:
+    """What has to be known of the steps before one to tell its changes.
+
+    Attributes:
+        course: what the guards did in the preceding step.
+        touched: guards below zero two steps before.
+        steps, events, replaced: numbers so far; see `OnsetCounts`.
+    """
+
+    course: Course
+    touched: Bool[Array, " guards"]
+    steps: Int32[Array, ""]
+    events: Int32[Array, ""]
+    replaced: Int32[Array, ""]
+
+    @classmethod
+    def none(cls, like: Course) -> "Past":
+        """That of the first step, for which nothing begins or ends."""
+        nothing, zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like), jnp.zeros((), jnp.int32)
+        return cls(nothing, nothing.pushes, zero, zero, zero)
+
+
+def changes(here: Course, past: Past, timestep: float | Scalar) -> tuple[Past, Changes]:
+    """Where contacts and limits may begin in a step, or end under force (`at_touch` says whether they do)."""
+    active, before, started = here.distance < 0, past.course.distance < 0, past.steps > 0
+    crossing = crossings(here, past.course, timestep)
+    ends = before & past.course.pushes & (~active | crossing.ends)
+    happens = (crossing.begins | (active & ~before) | ends) & started
+    flags = crossing.begins, crossing.ends, happens, ends, ends ^ past.touched
+    kinds = sum(flag.astype(jnp.int8) * jnp.int8(kind) for flag, kind in zip(flags, _KINDS.values(), strict=True))
+    events = past.events + jnp.sum(happens, dtype=jnp.int32)
+    replaced = jnp.where(started, replaced_points(here, past.course, crossing), 0).astype(jnp.int32)
+    following = Past(here, before, past.steps + 1, events, past.replaced + replaced)
+    return following, Changes(crossing.since, jnp.asarray(kinds, jnp.int8), past.events, events)
+
+
+def events_of(found: Changes, slots: int) -> Events:
+    """The first events of a rollout.
 
     Args:
-        course: what the guards do in each step.
         slots: maximum number of events to return.
-        per_step: maximum number of them at one step; None for any.
     """
-    active = course.distance < 0
-    before = jnp.roll(active, 1, axis=0)
-    crossing = crossings(course, jax.tree.map(lambda leaf: jnp.roll(leaf, 1, axis=0), course), timestep)
-    begins = crossing.begins | (active & ~before)
-    ends = before & jnp.roll(course.pushes, 1, axis=0) & (~active | crossing.ends)
-    brief = ends ^ jnp.roll(active, 2, axis=0).at[:2].set(False)
-    happens = (begins | ends).at[0].set(False)
-    kept = happens if per_step is None else happens & (jnp.cumsum(happens, axis=1) <= per_step)
-    (flat,) = jnp.nonzero(kept.reshape(-1), size=slots, fill_value=happens.size)
-    used = flat < happens.size
-    step, guard = jnp.divmod(jnp.where(used, flat, happens.shape[1]), happens.shape[1])
-    at_step = jax.tree.map(lambda leaf: leaf[step], crossing)
-    absent, touching = jax.vmap(Crossings.others)(at_step, guard)
-    events = Events(step, guard, ends[step, guard], brief[step, guard], absent, touching, used)
-    return events, (jnp.sum(happens) - jnp.sum(used), replaced_points(course, crossing))
+
+    def next_event(step: Array, slot: Array) -> tuple[Array, Events]:
+        later = lambda at: (at < len(found.after) - 1) & (found.after[at] <= slot)  # noqa: E731
+        step = jax.lax.while_loop(later, lambda at: at + 1, step)
+        used, kinds = slot < jnp.minimum(found.after[-1], slots), found.kinds[step]
+        begins, ends, happens, under_force, brief = (kinds & jnp.int8(kind) != 0 for kind in _KINDS.values())
+        guard = jnp.argmax(jnp.cumsum(happens) > slot - found.before[step])
+        others = Crossings(begins, ends, found.since[step]).others(guard)
+        at = jnp.where(used, step, 1), jnp.where(used, guard, 0)
+        return step, Events(*at, under_force[guard], brief[guard], *others, used)
+
+    return jax.lax.scan(next_event, jnp.zeros((), jnp.int32), jnp.arange(max(slots, 1), dtype=jnp.int32))[1]
 
 
 @register_pytree
@@ -162,27 +211,18 @@ def crossings(here: Course, preceding: Course, timestep: float | Scalar) -> Cros
     return Crossings(begins, ends, jnp.where(begins, begun, 1 + preceding.room / jnp.where(ends, leaves, 1.0)))
 
 
-def replaced_points(course: Course, crossing: Crossings) -> Int[Array, ""]:
-    """Number of contact points that appear or vanish where no guard passes zero; see `OnsetCounts`."""
-    if course.points is None:
-        return jnp.zeros((), int)
-    contacts = course.points.reach.shape[1]
-    flags = [each[:, -contacts:] for each in (course.distance < 0, course.pushes, crossing.begins, crossing.ends)]
-    here, there = (
-        jax.tree.map(lambda leaf, part=part: leaf[part], (course.points, *flags))
-        for part in (slice(1, None), slice(-1))
-    )
-    return jnp.sum(jax.vmap(partial(unrolled, _replaced))(here, there))
-
-
-def _replaced(here: Any, there: Any) -> Int[Array, ""]:
-    """Number of contact points that appear, or that vanish under force, from one step to the next.
+def replaced_points(here: Course, preceding: Course, crossing: Crossings) -> Int[Array, ""]:
+    """Number of contact points that appear, or that vanish under force, in a step where no guard passes zero.
 
     Args:
-        here: points of a step; whether each touches, pushes, begins, and whether the one before ends.
-        there: the same of the step before.
+        here, preceding: what the guards do in the step, and did in the one before.
+        crossing: the crossings between them.
     """
-    (points, touching, _, begins, ends), (others, touched, pushed, *_) = here, there
+    points, others = here.points, preceding.points
+    if points is None or others is None:
+        return jnp.zeros((), int)
+    flags = here.distance < 0, preceding.distance < 0, preceding.pushes, crossing.begins, crossing.ends
+    touching, touched, pushed, begins, ends = (each[-len(points.reach) :] for each in flags)
     same = jnp.all(points.geom[:, None] == others.geom[None], axis=-1) & touching[:, None] & touched[None]
     moved = jnp.linalg.norm(points.place[:, None] - others.place[None], axis=-1)
     near = same & (moved <= jnp.maximum(points.reach[:, None], others.reach[None]))
