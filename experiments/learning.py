@@ -328,7 +328,7 @@ def table(lines: list[dict[str, Any]], name: str) -> str:
     for method in [*METHODS, "ppo"]:
         if seeds := _new_seeds(lines, name, method):
             numbers = [np.concatenate([np.ravel(each[column]) for each in seeds]) for column in columns]
-            window = f", {each}/{PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
+            window = f", {each:g}/{PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
             chosen = f"{seeds[0]['rate']:.2g}{window}"
             rows.append((f"`{method}`" if method != "ppo" else "PPO", chosen, *map(_with_interval, numbers)))
     return markdown_table(rows, HEADINGS)
