@@ -186,8 +186,7 @@ def sampled(name: str, family: str, onset: str) -> dict[str, Any]:
     drawn = np.random.default_rng(1).normal(size=task.policy.num_params)
     along = np.ones(task.theta.size) if name == "pusher" else drawn
     along /= np.linalg.norm(along)
-    size = POINTS
-    keys, pairs = (jax.random.split(jax.random.key(seed), size) for seed in range(2))
+    keys, pairs = (jax.random.split(jax.random.key(seed), POINTS) for seed in range(2))
     reach = task.sigma / 2
     below, above = (np.asarray(objective.evaluate(task.theta + t * along, pairs).value) for t in (-reach, reach))
     zeroth = np.asarray(zeroth_order(objective.evaluate(task.theta, keys), "zero_noise").per_sample)

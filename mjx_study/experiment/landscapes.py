@@ -25,7 +25,6 @@ from jaxtyping import Array, Float, Int
 from estimators import Estimator
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.gradient_numbers import estimate_of, padded
-from mjx_study.experiment.memory import padded_size
 from mjx_study.experiment.quadrature import QUADRATURE, Line, Means, applies, closed_form, grid, means
 from mjx_study.experiment.resolution import line_of
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, unconverged
@@ -102,14 +101,13 @@ class LandscapeComputation(Computation):
         task, chosen = plan.task_of(cell), estimators_of(plan, cell)
         line = line_of(task, config.settings.points, config.span, config.direction, config.seed)
         keys, columns, solved = cell_keys(config.seed, config.seeds), [], []
+        samples, size = np.asarray(config.seeds * cell.samples), plan.padded_samples(cell, config.seeds)
         for theta in line.thetas(task.theta.dtype):
             drawn, _, residuals = draw_batches(objective, theta, keys, plan.oracles, cell.samples, slice(None))
             solved += residuals.values()
             pooled = jax.tree.map(lambda leaf: leaf.reshape(1, -1, *leaf.shape[2:]), drawn)
-            samples = config.seeds * cell.samples
-            size = padded_size(samples) if all(each.mergeable for each in chosen) else samples
-            pooled = jax.tree.map(lambda leaf, size=size: padded(leaf, size)[0], pooled)
-            columns.append(jax.device_get(_slopes(pooled, np.asarray(samples), line.direction, chosen)))
+            pooled = jax.tree.map(lambda leaf: padded(leaf, size)[0], pooled)
+            columns.append(jax.device_get(_slopes(pooled, samples, line.direction, chosen)))
         arrays = {name: np.stack([column[name] for column in columns], axis=-1) for name in columns[0]}
         arrays |= {
             "position": line.position,

@@ -125,11 +125,11 @@ class StudyPlan:
         each = bytes_per_sample(self.task_of(cell), self.oracles, len(self.config.estimators))
         return self.padded_samples(cell) * each
 
-    def padded_samples(self, cell: StudyCell) -> int:
-        """Number of samples to which whole batches are padded for their statistics: their own unless all estimators
-        are mergeable, and so ignore padding."""
-        mergeable = all(each.mergeable for each in estimators_of(self, cell))
-        return padded_size(cell.samples) if mergeable else cell.samples
+    def padded_samples(self, cell: StudyCell, seeds: int = 1) -> int:
+        """Number of samples to which whole batches, of several seeds together, are padded for their statistics: their
+        own unless all estimators are mergeable, and so ignore padding."""
+        samples, mergeable = seeds * cell.samples, all(each.mergeable for each in estimators_of(self, cell))
+        return padded_size(samples) if mergeable else samples
 
     @property
     def iterations(self) -> int | None:

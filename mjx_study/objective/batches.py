@@ -167,9 +167,7 @@ class MjxObjective:
         values, scores, residuals = self._run("value", theta, keys, rows, scale)
         with np.errstate(all="ignore"):  # lost samples are counted with the estimates
             odd = (values[:samples] - values[samples:]) / 2
-            residual = (np if isinstance(residuals, np.ndarray) else jnp).maximum(
-                residuals[:samples], residuals[samples:]
-            )
+            residual = _numpy_of(residuals).maximum(residuals[:samples], residuals[samples:])
         return Evaluation(*map(_placed, (odd, scores[:samples], np.zeros(samples, odd.dtype), residual)))
 
     def evaluate_pair(self, theta: Theta, keys: Keys) -> tuple[Evaluation, Evaluation]:
@@ -291,8 +289,8 @@ class TracedObjective(MjxObjective):
         chunks = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1).reshape(-1, chunk)
         key_data, sigma = jax.random.key_data(keys), jnp.asarray(self.sigma, dtype)
         kept = simulator._programs[name]
-        types = theta, self.contact, sigma, *simulator._chunk(theta, None, 1.0)[-2:]
-        program = kept.jitted if self.batched else kept.within(*types)
+        blank = simulator._chunk(theta, None, 1.0)[-2:]
+        program = kept.jitted if self.batched else kept.within(theta, self.contact, sigma, *blank)
 
         def call(chunk):
             drawn, factor = chunk
@@ -318,8 +316,12 @@ def _placed(leaf: Any) -> Any:
 
 def _for_all(rows, samples: int):
     """Broadcast rows, one per sample or one for all; on the host, to avoid a compilation per size."""
-    numpy = np if isinstance(rows, np.ndarray) else jnp
-    return numpy.broadcast_to(rows, (samples, *rows.shape[1:]))
+    return _numpy_of(rows).broadcast_to(rows, (samples, *rows.shape[1:]))
+
+
+def _numpy_of(array: Any) -> Any:
+    """NumPy, or JAX's for its arrays."""
+    return np if isinstance(array, np.ndarray) else jnp
 
 
 def contact_for(name: str, contact: ContactModel | None) -> ContactModel | None:
