@@ -1,6 +1,7 @@
 """Native code computes what JAX's operations do, for batches of any size, and does without where it must."""
 
 import os
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -282,6 +283,31 @@ def test_without_a_compiler(setting, lines):
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment)
     assert done.stdout.splitlines()[-1] == "[2. 2. 2.]" and "native" not in done.stdout
     assert done.stderr.count("mjx-study: no C compiler found: steps run through XLA, more slowly") == lines
+
+
+def test_the_compiler_from_pypi(tmp_path):
+    """The package's module runs a compiler with the arguments after `cc`, as Zig's does."""
+    (word, *_), _ = build.compiler() or (("",), "")
+    real, path = shutil.which(word), os.environ["PATH"]
+    script = f"import os, sys\nos.environ['PATH'] = {path!r}\nos.execv({real!r}, [{real!r}, *sys.argv[2:]])\n"
+    (tmp_path / "ziglang").mkdir()
+    (tmp_path / "ziglang" / "__main__.py").write_text(script)
+    environment = {key: value for key, value in os.environ.items() if key != "CC"} | {
+        "PATH": "/nowhere",
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+        "XDG_CACHE_HOME": str(tmp_path / "cache"),
+    }
+    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment)
+    assert "native" in done.stdout and not done.stderr
+
+
+def test_long_sources_are_built_quickly(monkeypatch, folder):
+    commands = []
+    run = build._run
+    monkeypatch.setattr(build, "_run", lambda *words, **options: commands.append(words) or run(*words, **options))
+    monkeypatch.setattr(build, "LONG", 0)
+    source = c.source_of(capture(lambda x: x * 3, jax.ShapeDtypeStruct((), float), most=9))
+    assert build.library_ready(build.build_library(source)) and {*build.QUICKLY} <= {*commands[-1]}
 
 
 def test_processes_build_at_once(tmp_path):
