@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from mjx_study.graph.function import Passes, ScalarFunction, depending_on
-from mjx_study.graph.nodes import Node, entries_of, needed_for, no_type_check
+from mjx_study.graph.nodes import Node, depth_first, entries_of, no_type_check
 from mjx_study.graph.parts import Loop, Statement, in_parts
 
 _OPERATORS: Final = {
@@ -140,6 +140,7 @@ class _Writer:
 
     def __init__(self, function: ScalarFunction):
         self._function = function
+        self._order = depth_first(entries_of(function.outputs))
         self.dtypes: set[Any] = set()
         self.loads: dict[int, str] = {}
         self._stores: dict[int, list[str]] = {}
@@ -153,7 +154,7 @@ class _Writer:
         self.loads = self._loaded(range(len(self._function.inputs)))
         constant = self._stores_of(range(len(self._function.outputs)), self._function.outputs)
         known = [self._stored(number, number) for number in self.loads]
-        return [*itertools.chain(*known), *self._written(self._function.needed), *constant]
+        return [*itertools.chain(*known), *self._written(self._order), *constant]
 
     def loop(self, passes: Passes) -> list[Statement | Loop]:
         """All statements of a loop with the function as its body; what is the same in all passes comes before it."""
@@ -164,12 +165,12 @@ class _Writer:
         starts = self._loaded(range(first, second))
         begin = [Statement(text, frozenset(), self._kinds([at])) for at, text in starts.items()]
         changing = depending_on(function.needed, [*carried, *entries_of(function.inputs[second:])])
-        fixed = self._written(each for each in function.needed if each.number not in changing)
+        fixed = self._written(each for each in self._order if each.number not in changing)
         rows = self._loaded(range(second, len(function.inputs)), each_pass=True)
         outputs = range(passes.num_carry, len(function.outputs))
         constant = self._stores_of(outputs, function.outputs[passes.num_carry :], each_pass=True)
         known = [self._stored(number, name) for number, name in self._names.items()]
-        body = [*itertools.chain(*known), *self._written(function.needed), *constant]
+        body = [*itertools.chain(*known), *self._written(self._order), *constant]
         moved = [(each.number, value) for each, value in zip(carried, after, strict=True) if each is not value]
         kinds = self._kinds(at for at, _ in moved)
         lines = [f"{kinds[at]} next{at} = {self._value(value)};" for at, value in moved]
@@ -269,9 +270,9 @@ class _Writer:
         begin = self._statement([f"{kind} x{at} = {self._value(start)};" for (at, kind), start in starts], kinds)
         outside = dict(self._names) | {at: at for at in kinds}
         self._names = dict(outside)
-        test = self._written(needed_for(again))
+        test = self._written(depth_first(again))
         test.append(self._statement([f"mask x{node.number} = {self._value(again[0])};"], {node.number: "mask"}))
-        body = self._written(needed_for(after))
+        body = self._written(depth_first(after))
         self._uses |= {node.number, *kinds}
         lines = [
             f"{kinds[each.number]} next{each.number} = "
