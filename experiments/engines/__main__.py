@@ -12,12 +12,14 @@ import argparse
 import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Lock
+from typing import Final
 
 from experiments import ROOT
 from experiments.engines.catalog import ENGINES, HOME, interpreter
@@ -27,7 +29,8 @@ from experiments.pages import write_tables
 
 LIMIT = 900
 """Seconds that a cell may take."""
-ONE_CORE = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
+ONE_CORE: Final = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
+"""Of cells of which several are measured at a time."""
 
 
 def run(arguments: argparse.Namespace, target: Path) -> int:
@@ -43,16 +46,16 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
         every = itertools.product(arguments.scene or SCENES, arguments.timestep or TIMESTEPS)
         todo += [(python, name, scene, str(step)) for scene, step in every if (name, scene, step) not in found]
     writing, cores = Lock(), SimpleQueue()
-    for core in range(arguments.jobs):
+    pin = arguments.jobs > 1 and shutil.which("taskset") is not None
+    for core in itertools.islice(itertools.cycle(sorted(os.sched_getaffinity(0)) if pin else [0]), arguments.jobs):
         cores.put(core)
 
     def measure(cell: tuple[Path, str, str, str]) -> bool:
         core = cores.get()
         python, *words = cell
-        # A core of its own where there are several at a time; where that cannot be set, as on macOS, threads share.
-        pinned = ["taskset", "-c", str(core)] if arguments.jobs > 1 and hasattr(os, "sched_setaffinity") else []
-        command = [*pinned, python, "-m", "experiments.engines.worker", *words, *["quick"] * arguments.quick]
-        environment = {**os.environ, **ONE_CORE} if pinned else None
+        pinned, quick = ["taskset", "-c", str(core)] * pin, ["quick"] * arguments.quick
+        command = [*pinned, python, "-m", "experiments.engines.worker", *words, *quick]
+        environment = {**os.environ, **ONE_CORE} if arguments.jobs > 1 else None
         said, failed = "measured", False
         try:
             done = subprocess.run(

@@ -40,7 +40,7 @@ from mjx_study.simulation.law import LAWS as OTHERS
 
 MORE: Final = (
     *("skid", "tennis", "landing", "box", "corners"),
-    *("roll", "stack", "stack of corners", "quadruped standing", "quadruped landing"),
+    *("roll", "stack", "stacked_corners", "quadruped standing", "quadruped landing"),
 )
 
 

@@ -22,7 +22,7 @@ LAWS: Final = {
 }
 """Contact family and onset term by the name of a row."""
 MEANS: Final = ("throw", "ball_wall", "skid", "corners", "box", "pusher", "tennis", "landing")
-BODIES: Final = ("roll", "stack", "stack of corners", "quadruped standing", "quadruped landing")
+BODIES: Final = ("roll", "stack", "stacked_corners", "quadruped standing", "quadruped landing")
 KAPPAS: Final = ("throw, kappa 0.1", "throw", "throw, kappa 10")
 RIGID: Final = "rigid"
 """In place of a law: the C engine's limit of stiff contact and short steps."""

@@ -159,7 +159,7 @@ SCENES: Final[dict[str, Callable[[], Task]]] = {
     **{"throw": throw, "skid": skid, "roll": partial(skid, "rolling"), "box": box, "corners": partial(box, "corners")},
     **{
         "stack": stack,
-        "stack of corners": partial(stack, "stack of corners"),
+        "stacked_corners": partial(stack, "stacked_corners"),
         "ball_wall": partial(make_task, "ball_wall"),
     },
     **{f"quadruped {posture}": partial(quadruped, posture) for posture in ("standing", "landing")},
