@@ -4,16 +4,19 @@ import json
 import math
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from experiments import ROOT
+from experiments.engines import __main__ as command
 from experiments.engines import catalog, certify, references
 from experiments.engines.adapters import mujoco_family
 from experiments.engines.judge import combined, measure, verdict
 from experiments.engines.page import CELLS, PAGE, cells, tables
-from experiments.engines.scenes import SCENES
+from experiments.engines.scenes import RADIUS, SCENES, mjcf
 from experiments.pages import replace_tables
 
 SMALL = {"grid": 100, "strata": 100, "points": 20}
@@ -28,7 +31,8 @@ def test_exact_derivatives_of_a_toss_have_another_mean_than_the_slope(variant: s
     assert np.isclose(cell["slope"], cell["slope_by_differences"], rtol=0.1)
 
 
-RIGHT: dict[str, float] = {
+RIGHT: dict[str, Any] = {
+    "scene": "toss",
     **dict.fromkeys(("slope", "slope_by_differences", "mean", "mean_of_strata", "point_share"), 1.0),
     **dict.fromkeys(("slope_error", "mean_error", "point_error"), 0.0),
 }
@@ -47,17 +51,62 @@ RIGHT: dict[str, float] = {
         ({"mean": 2.0, "mean_of_strata": 2.6}, "unknown"),
         ({"mean": math.nan}, "unknown"),
         ({"mean": math.nan, "nan_share": 1.0}, "none"),
+        ({"state": [[0.3, 0, 0.04]]}, "no contact"),
+        ({"scene": "pendulum", "state": [[0.3, 0, 2.3]]}, "no joint"),
+        ({"scene": "pendulum", "state": [[0.3, 0, 1.6]]}, "right"),
+        (dict.fromkeys(("slope", "slope_by_differences", "mean", "mean_of_strata"), 1e-8), "at rest"),
     ],
 )
-def test_verdicts(changes: dict[str, float], said: str) -> None:
+def test_verdicts(changes: dict[str, Any], said: str) -> None:
     assert verdict(RIGHT | changes) == said
     assert combined([RIGHT | changes] * 2) == said
     assert combined([RIGHT | changes, None]) == f"{said}, -"
 
 
+def test_a_scene_that_an_engine_lacks_is_a_dash_with_a_reason() -> None:
+    lacking = {"error": "knows no walls"}
+    assert combined([lacking, None]) == "-"
+    said = tables({("jaxsim", "wall", 0.005): lacking})
+    assert f"| {catalog.ENGINES['jaxsim'].label} | wall | knows no walls |" in said["reasons"]
+    assert "JaxSim" not in said["wall"]
+
+
 def test_the_page_says_what_the_data_give() -> None:
     text = PAGE.read_text()
     assert replace_tables(text, tables(cells(CELLS))) == text
+
+
+@pytest.mark.parametrize("name", ["slide", "box_flat"])
+def test_the_rigid_limit_is_that_of_the_c_engine(name: str) -> None:
+    scene, thetas = SCENES[name], SCENES[name].center + SCENES[name].sigma * np.array([-1.0, 0.3, 1.0])
+    assert scene.exact is not None
+    model = certify.mujoco.MjModel.from_xml_string(mjcf(scene, 1e-4))
+    model.geom_solref[:, 0] = 1e-3
+    assert np.allclose(certify.native(scene, 1e-4, thetas, model)[0], scene.exact(thetas), atol=0.002)
+
+
+@pytest.mark.parametrize("name", ["bounce", "wall"])
+def test_the_rigid_limit_is_a_flight_that_reverses(name: str) -> None:
+    scene, step = SCENES[name], 1e-5
+    assert scene.exact is not None
+    for theta in scene.center + scene.sigma * np.array([-1.0, 0.3, 1.0]):
+        (body,) = scene.start(theta)
+        edge, way, axis = (RADIUS, 1, 2) if scene.wall is None else (scene.wall - RADIUS, -1, 0)
+        distance, speed = way * (body.position[axis] - edge), way * body.velocity[axis]
+        for _ in range(scene.steps(step)):
+            speed -= scene.gravity * step
+            distance += speed * step
+            speed = -scene.restitution * speed if distance < 0 > speed else speed
+        assert abs(edge + way * distance - scene.exact(theta)) < 1e-4
+
+
+def test_cells_of_other_files_are_added_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = '{"engine": "mjx", "scene": "toss", "timestep": 0.005}\n'
+    (tmp_path / "data").write_text(line)
+    (tmp_path / "more").write_text(line + line.replace("toss", "push"))
+    monkeypatch.setattr(command, "CELLS", tmp_path / "data")
+    command.merge([tmp_path / "more", tmp_path / "more"])
+    assert (tmp_path / "data").read_text() == line + line.replace("toss", "push")
 
 
 def test_environments_are_pinned_and_every_engine_has_one() -> None:
@@ -71,7 +120,7 @@ import dataclasses, json, os, sys
 os.environ["JAX_ENABLE_X64"] = "1"
 from importlib import import_module
 import numpy as np
-from experiments.engines.scenes import SCENES
+from experiments.engines.scenes import RADIUS, SCENES, mjcf
 scene = dataclasses.replace(SCENES["toss"], horizon=0.1)
 found = import_module("experiments.engines.adapters." + sys.argv[1]).build(scene, 0.005, sys.argv[2])(np.array([1.0]))
 print(json.dumps([found.positions[0, 0].tolist(), float(found.values[0]), float(found.derivatives[0])]))

@@ -1,65 +1,110 @@
 """Measure the missing cells of engines that are installed, each in a process of its own, or write the page.
 
-python -m experiments.engines [--quick] [--only ENGINE]: appends to data/engines.jsonl a line per cell, so that the same
-command resumes; --quick has a quarter of the rollouts, into build/engines/quick.jsonl, which no page is made of.
+python -m experiments.engines [--only ENGINE ...] [--scene SCENE ...] [--timestep H] [--quick]: appends to
+data/engines.jsonl a line per cell, so that the same command resumes; --quick has a quarter of the rollouts, into
+build/engines/quick.jsonl, which no page is made of. --jobs N measures N cells at a time, each on one core.
+--here runs all in this interpreter in place of the engines' environments, and --into FILE keeps what is new apart:
+so a machine without a network measures what its PYTHONPATH has, and `merge FILE ...` adds that to the data.
 python -m experiments.engines page: writes the tables of docs/engines.md.
 """
 
 import argparse
+import itertools
 import json
+import os
+import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Lock
+from typing import Final
 
 from experiments import ROOT
 from experiments.engines.catalog import ENGINES, HOME, interpreter
-from experiments.engines.page import CELLS, PAGE, SHOWN, cells, tables
-from experiments.engines.scenes import TIMESTEPS
+from experiments.engines.page import CELLS, PAGE, cells, tables
+from experiments.engines.scenes import SCENES, TIMESTEPS
 from experiments.pages import write_tables
 
 LIMIT = 900
 """Seconds that a cell may take."""
+ONE_CORE: Final = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
+"""Of cells of which several are measured at a time."""
 
 
-def run(target: Path, names: list[str], *, quick: bool) -> int:
-    """Measure what `target` lacks of the engines named, and return how many cells failed."""
+def run(arguments: argparse.Namespace, target: Path) -> int:
+    """Measure what the data and `target` lack, and return how many cells failed."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    found, failed = cells(target), 0
-    for name in names:
-        python = interpreter(ENGINES[name])
+    found = {**({} if arguments.quick else cells(CELLS)), **cells(target)}
+    todo = []
+    for name in arguments.only or ENGINES:
+        python = Path(sys.executable) if arguments.here else interpreter(ENGINES[name])
         if not python.exists():
             print(f"{name}: not installed, skipped: python -m experiments.engines.install {ENGINES[name].environment}")
             continue
-        for scene, timestep in ((scene, timestep) for scene in SHOWN for timestep in TIMESTEPS):
-            if (name, scene, timestep) in found:
-                continue
-            words = [python, "-m", "experiments.engines.worker", name, scene, str(timestep), *["quick"] * quick]
-            try:
-                done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT, check=True)
-            except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
-                failed += 1
-                print(f"{name} {scene} {timestep}: FAILED: {str(error.stderr or error)[-500:]}", flush=True)
-                continue
+        every = itertools.product(arguments.scene or SCENES, arguments.timestep or TIMESTEPS)
+        todo += [(python, name, scene, str(step)) for scene, step in every if (name, scene, step) not in found]
+    writing, cores = Lock(), SimpleQueue()
+    pin = arguments.jobs > 1 and shutil.which("taskset") is not None
+    for core in itertools.islice(itertools.cycle(sorted(os.sched_getaffinity(0)) if pin else [0]), arguments.jobs):
+        cores.put(core)
+
+    def measure(cell: tuple[Path, str, str, str]) -> bool:
+        core = cores.get()
+        python, *words = cell
+        pinned, quick = ["taskset", "-c", str(core)] * pin, ["quick"] * arguments.quick
+        command = [*pinned, python, "-m", "experiments.engines.worker", *words, *quick]
+        environment = {**os.environ, **ONE_CORE} if arguments.jobs > 1 else None
+        said, failed = "measured", False
+        try:
+            done = subprocess.run(
+                command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=True
+            )
             line = done.stdout.splitlines()[-1]
             json.loads(line)
-            with target.open("a") as file:
+            with writing, target.open("a") as file:
                 file.write(line + "\n")
-            print(f"{name} {scene} {timestep}: measured", flush=True)
-    return failed
+        except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+            said, failed = f"FAILED: {str(error.stderr or error)[-500:]}", True
+        print(*words, said, flush=True)
+        cores.put(core)
+        return failed
+
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        return sum(pool.map(measure, todo))
+
+
+def merge(files: list[Path]) -> None:
+    """Append the cells of other files that the data lack."""
+    found = cells(CELLS)
+    with CELLS.open("a") as target:
+        for file in files:
+            new = {key: cell for key, cell in cells(file).items() if key not in found}
+            target.writelines(json.dumps(cell) + "\n" for cell in new.values())
+            found = {**found, **new}
+            print(f"{file}: {len(new)} cells added")
 
 
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m experiments.engines", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=("measure", "page"), default="measure")
+    parser.add_argument("what", nargs="?", choices=("measure", "page", "merge"), default="measure")
+    parser.add_argument("files", nargs="*", type=Path, help="of merge")
     parser.add_argument("--quick", action="store_true", help="a quarter of the rollouts, kept apart from the data")
-    parser.add_argument("--only", choices=tuple(ENGINES), help="one engine")
+    parser.add_argument("--only", nargs="+", choices=tuple(ENGINES), help="these engines", metavar="ENGINE")
+    parser.add_argument("--scene", nargs="+", choices=tuple(SCENES), help="these scenes", metavar="SCENE")
+    parser.add_argument("--timestep", nargs="+", type=float, choices=TIMESTEPS, help="[s]")
+    parser.add_argument("--jobs", type=int, default=1, help="cells at a time")
+    parser.add_argument("--here", action="store_true", help="in this interpreter, not in the engines' environments")
+    parser.add_argument("--into", type=Path, help="file in place of the data")
     arguments = parser.parse_args()
     if arguments.what == "page":
         write_tables(PAGE, tables(cells(CELLS)))
-        return
-    target = HOME / "quick.jsonl" if arguments.quick else CELLS
-    sys.exit(bool(run(target, [arguments.only] if arguments.only else list(ENGINES), quick=arguments.quick)))
+    elif arguments.what == "merge":
+        merge(arguments.files)
+    else:
+        sys.exit(bool(run(arguments, arguments.into or (HOME / "quick.jsonl" if arguments.quick else CELLS))))
 
 
 if __name__ == "__main__":

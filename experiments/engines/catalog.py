@@ -46,7 +46,6 @@ class Engine:
 
 ENVIRONMENTS: Final = {
     "own": Environment(),
-    "mujodico": Environment(("mujodico==3.17.0", "mujoco==4.0.0", "jax==0.10.2")),
     "brax": Environment(("brax==0.14.2", "mujoco-mjx==3.17.0", "mujoco==4.0.0", "jax==0.10.2")),
     "old_mjx": Environment(
         ("mujoco-mjx==3.1.6", "mujoco==3.1.6", "jax==0.4.30", "jaxlib==0.4.30", "numpy<2", "scipy<1.13")
@@ -63,7 +62,7 @@ ENGINES: Final = {
     "mjx_study": Engine("mjx_study.step", "own", "mujoco_family", "plain", "reverse mode"),
     "mjx_study_onset": Engine('mjx_study.step, onset="linear"', "own", "mujoco_family", "onset", "reverse mode"),
     **{
-        f"mujodico_{law}": Engine(f"mujodico 3.17.0, {law}", "mujodico", "mujoco_family", law, "forward mode")
+        f"mujodico_{law}": Engine(f"mujodico 3.17.0, {law}", "own", "mujoco_family", law, "forward mode")
         for law in ("hunt_crossley", "kelvin_voigt", "log_barrier", "conic")
     },
     **{

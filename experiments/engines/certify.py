@@ -35,9 +35,14 @@ HOW: Final = {
 }
 
 
-def native(scene: Scene, timestep: float, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the C engine's costs [points] and positions [points, bodies, 3], its solver run to convergence."""
-    model = mujoco.MjModel.from_xml_string(mjcf(scene, timestep))
+def native(
+    scene: Scene, timestep: float, thetas: np.ndarray, model: mujoco.MjModel | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the C engine's costs [points] and positions [points, bodies, 3], its solver run to convergence.
+
+    `model`: in place of the scene's.
+    """
+    model = model or mujoco.MjModel.from_xml_string(mjcf(scene, timestep))
     model.opt.tolerance, model.opt.iterations, model.opt.ls_tolerance = 0, 200, 1e-6
     data = mujoco.MjData(model)
     is_velocity, index = mjcf_index(scene)

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.engines.scenes import RADIUS, SCENES, Scene, Simulate
+from experiments.engines.scenes import LENGTH, PIVOT, RADIUS, SCENES, Scene, Simulate
 
 REACH: Final = 5.0
 """The grid's half width, in standard deviations."""
@@ -24,6 +24,8 @@ MORE: Final = {"grid": 1600, "strata": 1600, "points": 200}
 FEW: Final = {"grid": 100, "strata": 100, "points": 50}
 AGREES, DIFFERS = 0.03, 0.1
 """Relative errors of the mean up to which it is called right, and from which wrong; in between it is close."""
+STILL: Final = 1e-7
+"""Change of the end with the noise [m] up to which a body is called at rest."""
 POINTS: Final = 0.9
 """Share of the points at which a derivative must be that of differences for it to be called right there."""
 
@@ -59,7 +61,7 @@ def measure(simulate: Simulate, scene: Scene, counts: Mapping[str, int], *, sing
     # One-sided differences disagree where rounding or a jump does not let them decide, in single precision.
     vague = np.abs(upper.values - 2 * at.values + lower.values) / (2 * reach) if single else np.zeros(len(thetas))
     errors = np.maximum(np.abs(at.derivatives - differences) - vague, 0) / scale
-    exact = None if scene.exact is None else float(first.positions[0, 0, 0] - scene.exact(np.array(center)))
+    exact = None if scene.exact is None else float(first.values[0] - scene.exact(np.array(center)))
     nominal = len(thetas) // 2
     return {
         "slope": slope,
@@ -102,18 +104,21 @@ def verdict(cell: Mapping[str, Any]) -> str:
 
     `right`, at points and on average; `close`, right at points and off by little; `biased`, right at points alone;
     `average`, right on average alone; `wrong`; `none`, no derivatives or NaN everywhere; `no contact`, the body went
-    through a plane; or `unknown`: the two ways to
-    the slope or to the mean differ by more than the verdict bears.
+    through a plane; `no joint`, the pendulum left its rod; `at rest`, the end does not depend on the parameter; `-`,
+    the engine has no such scene; or `unknown`: the two ways to the slope or to the mean differ by more than the verdict
+    bears.
     """
     if "error" in cell:
-        return cell["verdict"]
-    if passed_through(cell):
-        return "no contact"
+        return "-"
+    if (lost := lost_constraint(cell)) is not None:
+        return lost
     if cell.get("nan_share") == 1:
         return "none"
     slope, mean = cell["slope"], cell["mean"]
     if not all(math.isfinite(cell[key]) for key in ("slope", "mean", "mean_of_strata", "point_error")):
         return "unknown"
+    if max(abs(slope), abs(mean)) * SCENES[cell["scene"]].sigma < STILL:
+        return "at rest"
     unsure = max(abs(slope - cell["slope_by_differences"]), cell["slope_error"])
     vague = max(abs(mean - cell["mean_of_strata"]), cell["mean_error"])
     off, scale = abs(mean - slope), max(abs(slope), 1e-9)
@@ -126,12 +131,15 @@ def verdict(cell: Mapping[str, Any]) -> str:
     return "average" if agrees else "wrong" if differs else "unknown"
 
 
-def passed_through(cell: Mapping[str, Any]) -> bool:
-    """Return whether a cell's body ends with its center within half its radius of a plane, or behind it."""
+def lost_constraint(cell: Mapping[str, Any]) -> str | None:
+    """Return `no contact` if a cell's body ends with its center within half its radius of a plane, or behind it, and
+    `no joint` if a pendulum's length is off by a tenth or NaN."""
     if "state" not in cell:
-        return False
+        return None
     scene, (x, _, z) = SCENES[cell["scene"]], cell["state"][0]
-    return (scene.floor and z < RADIUS / 2) or (scene.wall is not None and x > scene.wall - RADIUS / 2)
+    if scene.bodies[0].shape == "pendulum":
+        return None if abs(math.hypot(x, z - PIVOT) - LENGTH) < 0.1 * LENGTH else "no joint"
+    return "no contact" if (scene.floor and z < RADIUS / 2) or (scene.wall and x > scene.wall - RADIUS / 2) else None
 
 
 def combined(cells: Sequence[Mapping[str, Any] | None]) -> str:

@@ -8,14 +8,11 @@ from typing import Any, Final
 from experiments import DATA, DOCS
 from experiments.engines.catalog import ENGINES
 from experiments.engines.judge import combined
-from experiments.engines.scenes import TIMESTEPS
+from experiments.engines.scenes import SCENES, TIMESTEPS
 from experiments.pages import markdown_row
 
 CELLS: Final = DATA / "engines.jsonl"
 PAGE: Final = DOCS / "engines.md"
-SHOWN: Final = ("toss", "ball_wall", "slide")
-"""Scenes that are measured and shown."""
-
 Cells = Mapping[tuple[str, str, float], Mapping[str, Any]]
 
 
@@ -27,11 +24,21 @@ def cells(path: Path) -> Cells:
 
 def tables(found: Cells) -> dict[str, str]:
     """Return the page's tables: verdicts by engine and scene, and the numbers of each scene."""
-    matrix = [markdown_row("engine", "differentiated in", *SHOWN), "|---" * (len(SHOWN) + 2) + "|"]
+    matrix = [markdown_row("engine", "differentiated in", *SCENES), "|---" * (len(SCENES) + 2) + "|"]
     for name, engine in ENGINES.items():
-        rows = [[found.get((name, scene, step)) for step in TIMESTEPS] for scene in SHOWN]
+        rows = [[found.get((name, scene, step)) for step in TIMESTEPS] for scene in SCENES]
         matrix.append(markdown_row(engine.label, engine.how, *map(combined, rows)))
-    return {"matrix": "\n".join(matrix), **{scene: _numbers(found, scene) for scene in SHOWN}}
+    return {"matrix": "\n".join(matrix), "reasons": _reasons(found)} | {each: _numbers(found, each) for each in SCENES}
+
+
+def _reasons(found: Cells) -> str:
+    """Why scenes were not measured: the engines' reasons, and their cells."""
+    cells: dict[tuple[str, str], list[str]] = {}
+    for (name, scene, step), cell in found.items():
+        if "error" in cell and step == TIMESTEPS[0]:
+            cells.setdefault((ENGINES[name].label, cell["error"]), []).append(scene)
+    rows = [markdown_row(label, ", ".join(scenes), reason) for (label, reason), scenes in cells.items()]
+    return "\n".join([markdown_row("engine", "scenes", "reason"), "|---|---|---|", *rows])
 
 
 def _numbers(found: Cells, scene: str) -> str:
@@ -40,13 +47,13 @@ def _numbers(found: Cells, scene: str) -> str:
     lines = [markdown_row("engine", f"slope, {steps} ms", "E[FoBG]", "right at points"), "|---|---|---|---|"]
     for name, engine in ENGINES.items():
         row = [found.get((name, scene, step)) for step in TIMESTEPS]
-        if any(row):
+        if any(cell and "slope" in cell for cell in row):
             lines.append(
                 markdown_row(
                     engine.label,
                     ", ".join(_both(cell, "slope", "slope_by_differences") for cell in row),
                     ", ".join(_both(cell, "mean", "mean_of_strata") for cell in row),
-                    ", ".join("-" if cell is None else f"{cell.get('point_share', 0):.0%}" for cell in row),
+                    ", ".join(f"{cell['point_share']:.0%}" if cell and "slope" in cell else "-" for cell in row),
                 )
             )
     return "\n".join(lines)

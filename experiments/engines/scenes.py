@@ -50,8 +50,8 @@ class Scene:
         wall: x at which a plane faces the bodies, if any [m].
         friction: Coulomb's coefficient.
         restitution: where the engine has a coefficient or damping for it; 0 leaves the engine's default.
-        exact: the first body's x at the end by the parameter in the limit of rigid contact, and its derivative, if
-            known. It knows no compliance, so that an engine's state differs from it by more than rounding.
+        exact: the cost by the parameter in the limit of rigid contact, which bounces by `restitution`, if known. It
+            knows no compliance, so that an engine's cost differs from it by more than rounding.
     """
 
     bodies: tuple[Body, ...]
@@ -128,6 +128,25 @@ class CannotError(Exception):
     """An engine cannot simulate a scene, or not differentiate it, for the reason given."""
 
 
+def rigid_fall(height: np.ndarray, speed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return when a body that falls through a height [m] lands [s], and how fast [m/s]."""
+    last = np.sqrt(speed**2 + 2 * GRAVITY * height)
+    return (last - speed) / GRAVITY, last
+
+
+def rigid_bounce(z: np.ndarray) -> np.ndarray:
+    """Height of `bounce` at its end [m]."""
+    touch, speed = rigid_fall(z - RADIUS, 1.0)
+    left = 0.3 - touch
+    return RADIUS + 0.5 * speed * left - GRAVITY * left**2 / 2
+
+
+def rigid_landing(z: np.ndarray) -> np.ndarray:
+    """Cost of `box_flat`: friction takes half the speed of landing from 1 m/s at once, then brakes what is left."""
+    touch, speed = rigid_fall(z - RADIUS, 1.0)
+    return touch + np.maximum(1 - 0.5 * speed, 0) ** 2 / (2 * 0.5 * GRAVITY) + RADIUS
+
+
 LANDED: Final = ((0.0, 0.0, 100.0),)
 AT_REST: Final = ((0.0, 0.0, RADIUS),)
 EDGE: Final = math.pi / 6
@@ -135,7 +154,16 @@ SCENES: Final = {
     "toss": Scene(
         (Body("sphere", (0, 0, 0.15), (1, 0, -1)),), "z", 0.15, 0.01, 0.4, ((1, 0, 1),), LANDED, AT_REST, friction=1.0
     ),
-    "bounce": Scene((Body("sphere", (0, 0, 0.3), (0, 0, -1)),), "z", 0.3, 0.04, 0.3, ((0, 0, 1),), restitution=0.5),
+    "bounce": Scene(
+        (Body("sphere", (0, 0, 0.3), (0, 0, -1)),),
+        "z",
+        0.3,
+        0.04,
+        0.3,
+        ((0, 0, 1),),
+        restitution=0.5,
+        exact=rigid_bounce,
+    ),
     "slide": Scene(
         (Body("box", (0, 0, RADIUS), (1, 0, 0)),),
         "vx",
@@ -145,7 +173,7 @@ SCENES: Final = {
         ((1, 0, 0),),
         exact=lambda speed: speed**2 / (2 * 0.5 * GRAVITY),
     ),
-    "ball_wall": Scene(
+    "wall": Scene(
         (Body("sphere", (0, 0, 1), (1, 0, 0)),),
         "vx",
         1.0,
@@ -167,8 +195,19 @@ SCENES: Final = {
         ((0, 0, 0), (1, 0, 0)),
         gravity=0,
         floor=False,
+        exact=lambda speed: 0.4 + np.maximum(0.5 * speed - 0.2, 0) / 2,
     ),
-    "box_flat": Scene((Body("box", (0, 0, 0.15), (1, 0, -1)),), "z", 0.15, 0.015, 0.4, ((1, 0, 1),), LANDED, AT_REST),
+    "box_flat": Scene(
+        (Body("box", (0, 0, 0.15), (1, 0, -1)),),
+        "z",
+        0.15,
+        0.015,
+        0.4,
+        ((1, 0, 1),),
+        LANDED,
+        AT_REST,
+        exact=rigid_landing,
+    ),
     "box_edge": Scene(
         (Body("box", (0, 0, 0.2), (0.5, 0, -1), EDGE),), "z", 0.2, 0.015, 0.4, ((1, 0, 1),), LANDED, AT_REST
     ),

@@ -7,7 +7,7 @@ python -m experiments.engines.worker ENGINE SCENE TIMESTEP [quick]
 import json
 import os
 import sys
-from importlib import import_module
+from importlib import import_module, metadata
 
 from experiments.engines.catalog import ENGINES
 from experiments.engines.judge import FEW, MANY, MORE, measure, verdict
@@ -20,16 +20,17 @@ def main() -> None:
     os.environ["JAX_ENABLE_X64"] = "1"
     name, scene, timestep = sys.argv[1:4]
     engine = ENGINES[name]
-    build = import_module(f"experiments.engines.adapters.{engine.adapter}").build
     counts = FEW if sys.argv[4:] else MANY
     try:
+        build = import_module(f"experiments.engines.adapters.{engine.adapter}").build
         simulate = build(SCENES[scene], float(timestep), engine.variant)
         found = measure(simulate, SCENES[scene], counts, single=engine.single)
         if counts is MANY and verdict(found | {"scene": scene}) == "unknown":
             found = measure(simulate, SCENES[scene], MORE, single=engine.single)
     except CannotError as error:
-        found = {"error": str(error), "verdict": "none" if "derivative" in str(error) else "unknown"}
-    print(json.dumps({"engine": name, "scene": scene, "timestep": float(timestep), **found}))
+        found = {"error": str(error)}
+    versions = {package: metadata.version(package) for package in ("jax", "mujoco") if package in sys.modules}
+    print(json.dumps({"engine": name, "scene": scene, "timestep": float(timestep), **found, "versions": versions}))
 
 
 if __name__ == "__main__":

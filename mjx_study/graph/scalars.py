@@ -54,11 +54,12 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
             del _CAPTURED[next(iter(_CAPTURED))]
         try:
             captured = capture(function, *arguments, most=2 * most)
+            captured = captured if is_small(captured) else None
+            if captured and any(node.operation == "whole" for node in captured.needed):
+                captured.derived["values"] = capture(function, *arguments, most=2 * most, values_only=True)
         except TooLargeError:
             captured = _left()
-        _CAPTURED[key] = captured = captured if captured and is_small(captured) else None
-        if captured and any(node.operation == "whole" for node in captured.needed):
-            captured.derived["values"] = capture(function, *arguments, most=2 * most, values_only=True)
+        _CAPTURED[key] = captured
     return _CAPTURED[key]
 
 

@@ -1,0 +1,136 @@
+"""Tables of docs/which-contact.md, from data/laws.jsonl and data/laws_checks.jsonl alone."""
+
+import itertools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy import stats
+
+from experiments import DATA
+from mjx_study.choices import TASK_DESCRIPTIONS
+from mjx_study.simulation.law import LAWS as OTHERS
+from mjx_study.table import markdown_table
+
+CELLS, CHECKS = DATA / "laws.jsonl", DATA / "laws_checks.jsonl"
+LAWS: Final = {
+    "MuJoCo's default": ("mujoco_default", "none"),
+    "with the onset term": ("mujoco_default", "linear"),
+    **{name: (name, "none") for name in ("smooth_onset", "penalty", *OTHERS)},
+}
+"""Contact family and onset term by the name of a row."""
+MEANS: Final = ("throw", "ball_wall", "skid", "corners", "box", "pusher", "tennis", "landing")
+BODIES: Final = ("roll", "stack", "stacked_corners", "quadruped standing", "quadruped landing")
+KAPPAS: Final = ("throw, kappa 0.1", "throw", "throw, kappa 10")
+RIGID: Final = "rigid"
+"""In place of a law: the C engine's limit of stiff contact and short steps."""
+ZEROTH: Final = "MuJoCo's default, zeroth order"
+CORNER: Final[dict[str, dict[str, float]]] = {
+    "the task": {},
+    **{f"friction {each:g}": {"friction": each} for each in (2.0, 1.0, 0.5)},
+    **{f"steps of {1e3 * each:g} ms": {"timestep": each} for each in (1e-3, 5e-4)},
+    **{f"kappa x {each:g}": {"scale": each} for each in (0.1, 10.0)},
+}
+"""Changes of `ball_wall` and of Kelvin-Voigt on it."""
+PYRAMIDAL: Final = {*itertools.product(("sliding_box", "ball_wall", "gripper", "landing"), ("log_barrier", "conic"))}
+"""Tasks and laws that need pyramidal cones."""
+CHECKED: Final = tuple(name for name in TASK_DESCRIPTIONS if not name.endswith((":dome", ":published")))
+
+
+def measured(*others: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    """The numbers of both files, and of others, by scene and row."""
+    lines = [line for path in (CELLS, CHECKS, *others) if path.exists() for line in path.read_text().splitlines()]
+    return {(each.pop("scene"), each.pop("row")): each for each in map(json.loads, lines)}
+
+
+def tables() -> dict[str, str]:
+    """The tables of the page; a dash where nothing was measured."""
+    found = measured()
+
+    def cell(scene: str, row: str, say: Callable[[dict[str, Any]], str]) -> str:
+        numbers = found.get((scene, row), {})
+        return "refused" if "refused" in numbers else say(numbers) if numbers else "-"
+
+    def bias(of: dict[str, Any]) -> str:
+        error = 100 * (of["first_error"] + of["slope_error"]) / abs(of["slope"])
+        shown = f"{100 * (of['first'] / of['slope'] - 1):.1f}".replace("-0.0", "0.0")
+        return f"{shown} %" if error < 0.05 else f"{shown} ± {float(f'{error:.1g}'):g} %"
+
+    def deviation(of: dict[str, Any]) -> str:
+        return f"{of['first_sd'] / of['zeroth_sd']:.2g}"
+
+    def share(row: str) -> str:
+        return cell("throw", row, lambda of: f"{1e3 * of['seconds']:.2g}")
+
+    def interval(costs: list[float], scale: float) -> str:
+        half = stats.t.ppf(0.975, len(costs) - 1) * np.std(costs, ddof=1) / len(costs) ** 0.5
+        return f"{scale * np.mean(costs):.4g} ± {scale * half:.1g}"
+
+    means = [[row, *(cell(scene, row, bias) for scene in MEANS), share(row)] for row in LAWS]
+    more = [[row, *(cell(scene, row, bias) for scene in BODIES)] for row in LAWS]
+    spreads = [[row, *(cell(scene, row, deviation) for scene in MEANS)] for row in LAWS]
+    says: dict[str, Callable[[dict[str, Any]], str]] = {
+        "depth at rest [mm]": lambda of: f"{1e3 * of['penetration']:.2g}",
+        "creep [mm/s]": lambda of: "slides" if of["creep_gain"] > 0.1 else f"{1e3 * of['creep']:.2g}",
+        "restitution": lambda of: f"{abs(of['restitution']):.2f}",
+        "way [mm]": lambda of: "slides" if of["rest"] > 0.1 else f"{1e3 * of['way']:.1f}",
+        "stable below [ms]": lambda of: "> 80" if of["first_bad_step"] > 1 else f"{1e3 * of['first_bad_step']:.0f}",
+    }
+    stands: dict[str, Callable[[dict[str, Any]], str]] = {
+        "rolls at [m/s]": lambda of: f"{of['rolling']:.3f}",
+        "slows in 0.5 s by": lambda of: f"{of['rolling_loss']:.2g}",
+        "lower sinks [mm]": lambda of: f"{1e3 * of['lower']:.2g}",
+        "upper [mm]": lambda of: f"{1e3 * of['upper']:.2g}",
+        "stands at [mm]": lambda of: f"{1e3 * of['stands_at']:.1f}",
+        "drifts [mm/s]": lambda of: f"{1e3 * of['drift']:.2g}",
+        "lands down to [mm]": lambda of: f"{1e3 * of['lowest']:.1f}",
+        "and goes [mm]": lambda of: f"{1e3 * of['way']:.0f}",
+    }
+    plain = [row for row, (_, onset) in LAWS.items() if onset == "none"]
+    fidelity = [[row, *(cell("faithful", row, say) for say in says.values())] for row in plain]
+    motion = [[row, *(cell("faithful bodies", row, say) for say in stands.values())] for row in (*plain, RIGID)]
+    descents = [
+        [row]
+        + [
+            cell(f"train {name}", row, lambda of, key=key, scale=scale: interval(of[key], scale))
+            for name, scale in (("pusher", 1.0), ("ball_wall", 1e3))
+            for key in ("own", "engine")
+        ]
+        + [cell("train pusher", row, lambda of: f"{of['seconds']:.0f}")]
+        for row in (*LAWS, ZEROTH)
+    ]
+    kappas = [
+        [row, *(cell(scene, row, lambda of: f"{of['first_sd'] / of['zeroth_sd']:.3g}") for scene in KAPPAS)]
+        for row in OTHERS
+    ]
+
+    def verdict(of: dict[str, Any]) -> str:
+        errors = (of[name] for name in ("of_cost", "of_step", "of_parameters") if of[name] is not None)
+        kinds = {kind: f", {kind}s" for kind in ("kink", "jump") if kind in of["verdicts"]}
+        return "wrong" if of["failing"] else f"right{''.join(kinds.values())} ({max(errors):.0e})"
+
+    def of_task(name: str, law: str) -> str:
+        turned = f"gradcheck {name} pyramidal"
+        marked = lambda of: f"{verdict(of)} *"  # noqa: E731
+        return cell(turned, law, marked) if (name, law) in PYRAMIDAL else cell(f"gradcheck {name}", law, verdict)
+
+    checks = [[f"`{name}`", *(of_task(name, law) for law in OTHERS)] for name in CHECKED]
+    shares: dict[str, Callable[[dict[str, Any]], str]] = {
+        "share of the slope": lambda of: f"{100 * of['share']:.1f} %",
+        "of it in 1e-6 rad": lambda of: f"{100 * of['narrow']:.2g} %",
+    }
+    corners = [[row, *(cell("corner", row, say) for say in shares.values())] for row in CORNER]
+    ways = "pusher: own", "in C", "ball_wall: own [1e-3]", "in C [1e-3]", "pusher [s]"
+    rows = {
+        "means": (("law", *MEANS, "ms per gradient"), means),
+        "motion": (("law", *stands), motion),
+        "bodies": (("law", *BODIES), more),
+        "deviations": (("law", *MEANS), spreads),
+        "fidelity": (("law", *says), fidelity),
+        "descents": (("law", *ways), descents),
+        "smoothing": (("law", "kappa / 10", "kappa", "10 kappa"), kappas),
+    }
+    rows |= {"gradcheck": (("task", *OTHERS), checks), "corner": (("`ball_wall`", *shares), corners)}
+    return {name: markdown_table(lines, header) for name, (header, lines) in rows.items()}
