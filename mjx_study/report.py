@@ -14,13 +14,12 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from mjx_study.plots.panels import counted
 from mjx_study.plots.study import drawings_of, plot_study
 from mjx_study.results.kind import Drawing, findings_of, kind_of
 from mjx_study.results.rows import label_in, model_name, remains
 from mjx_study.results.variables import COORDINATES, DEBIASED, Variable
 from mjx_study.results.warnings import warnings_of
-from mjx_study.table import with_error
+from mjx_study.table import plural, with_error
 
 
 @xr.register_dataset_accessor("mjx_study")
@@ -85,7 +84,7 @@ def _summary(dataset: xr.Dataset) -> str:
     seeds, samples = dataset.sizes.get("seed", 1), int(dataset["samples"][-1])
     seed = f"Medians over {seeds} seeds, counts summed" if seeds > 1 else "One seed"
     return (
-        f"{seed}; {counted(samples, 'sample')} in a batch; ± one standard error; -: not defined, or explained by noise."
+        f"{seed}; {plural(samples, 'sample')} in a batch; ± one standard error; -: not defined, or explained by noise."
     )
 
 
