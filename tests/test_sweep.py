@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -162,10 +163,7 @@ def test_two_processes_share_a_study_and_a_third_has_nothing_to_do(undisturbed: 
 
 
 def copy_of(folder: Path, to: Path) -> Path:
-    (to / "cells").mkdir(parents=True)
-    for path in [folder / "study.json", *(folder / "cells").iterdir()]:
-        (to / path.relative_to(folder)).write_bytes(path.read_bytes())
-    return to
+    return shutil.copytree(folder, to, ignore=shutil.ignore_patterns("results.nc", "study.lock"))
 
 
 def test_a_folder_without_a_whole_study_json_is_refused(undisturbed: Path, tmp_path: Path) -> None:

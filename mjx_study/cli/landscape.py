@@ -16,8 +16,8 @@ examples:
   mjx-study landscape momentum_transfer --contact penalty,mujoco_default --stiffness 3000,100000
   mjx-study landscape pusher --direction 0 --span=-2,2   the first of 200 forces
 
-columns of the table, the minimum of the mean cost along the line:
-{explained(LANDSCAPES, "least_at", "least_cost")}
+columns of the table:
+{explained(LANDSCAPES, "least_cost", "least_at", "steepest", "nonfinite")}
 
 The figure shows costs above, and slopes below, with 95 % bands. Where the mean cost with noise has a slope that the
 mean of FoBG lacks, the cost jumps: first-order gradients do not see jumps.
