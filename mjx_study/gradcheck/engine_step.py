@@ -42,10 +42,10 @@ class EngineStep:
         layout, data, rows = self.layout, host_data(self.host, base), []
         for change in changes:
             self._set_state(data, base, change[: layout.num_state])
-            self._set_parameters(change[layout.num_state :] * layout.scales)
+            self.set_parameters(change[layout.num_state :] * layout.scales)
             mujoco.mj_step(self.host, data)
             rows.append(np.concatenate([tangent_of(self.host, reference, data.qpos), data.qvel, data.act]))
-        self._set_parameters(np.zeros(len(layout.scales)))
+        self.set_parameters(np.zeros(len(layout.scales)))
         return np.array(rows)
 
     def noise(self, base: HostState, reference: Float[np.ndarray, " nq"]) -> Float[np.ndarray, " outputs"]:
@@ -67,7 +67,8 @@ class EngineStep:
         data.qvel[:], data.act[:], data.ctrl[:] = base.qvel + qvel, base.act + act, base.control + control
         data.qacc_warmstart[:] = base.warmstart
 
-    def _set_parameters(self, change: Float[np.ndarray, " parameters"]) -> None:
+    def set_parameters(self, change: Float[np.ndarray, " parameters"]) -> None:
+        """Change the contact model of the steps to come, from that of the scene."""
         if not len(change):
             return
         solref, solimp, friction = np.split(change, [2, 7])
