@@ -32,8 +32,9 @@ class OnsetCounts:
         found: onsets of contacts and limits, and missed events.
         bounded: onsets and ends at grazing speed, whose term is bounded.
         missed: events left uncorrected for lack of slots.
-        strength: root-mean-square share of the approach speed that a corrected onset removes in one step; 0 if there is
-            none, and with the jump, whose error does not depend on it.
+        strength: root-mean-square share of the approach speed that a corrected onset removes in one step, by the force
+            at touch or by the spring at the depth of a step, h^2 k d, whichever is more; 0 if there is none, and with
+            the jump, whose error does not depend on it.
         first: step of the first onset; NaN if there is none.
         replaced: contact points of corners and edges that appear or vanish without their distance passing zero, for
             which there is no term.
