@@ -255,8 +255,10 @@ def _corrections(
     grouped = jax.tree.map(lambda leaf: jnp.resize(leaf, (-(-slots // math.prod(few)), *few, *leaf.shape[1:])), events)
     _, each = jax.lax.scan(fill, None, grouped)
     flat = lambda leaf: leaf.reshape(-1, *leaf.shape[1 + len(few) :])[:slots]  # noqa: E731
-    terms, strength, narrow, valid = jax.tree.map(flat, each)
-    return terms, events.counts(past, valid, narrow, strength)
+    terms, strength, narrow, valid, rate = jax.tree.map(flat, each)
+    chatters = events.chattering(rate, scene.timestep)
+    spread, shift = (jnp.where(chatters[:, None], 0.0, part) for part in (terms.spread, terms.shift))
+    return terms._replace(spread=spread, shift=shift), events.counts(past, valid, narrow, strength, chatters)
 
 
 Moving = Mapping[int, Array]
@@ -273,9 +275,9 @@ def onset_term(
     controls: Float[Array, "cases nu"],
     event: Events,
     moving: Moving = MappingProxyType({}),
-) -> tuple[Terms, Scalar, Bool[Array, ""], Bool[Array, ""]]:
+) -> tuple[Terms, Scalar, Bool[Array, ""], Bool[Array, ""], Scalar]:
     """Term of an event, share of the approach speed lost (see `OnsetCounts`), whether D was bounded, and whether the
-    contact begins or ends by motion within the step; zeros and False otherwise.
+    contact begins or ends by motion within the step; zeros and False otherwise. Last, `guards.relaxation_rate`.
 
     Delta is v'(on) - v'(off) at first touch, and n the derivative of the guard's distance over the nv coordinates, then
     over the entries of the model's moving leaves.
@@ -307,7 +309,7 @@ def onset_term(
     strength = jnp.maximum(-model.opt.timestep * (normal @ jump) / cell, (model.opt.timestep * found.rate) ** 2)
     term = Terms(last * jump / cell, earlier * jump / cell, slope)
     term, strength = jax.tree.map(lambda each: jnp.where(valid, each, 0.0), (term, strength))
-    return term, strength, valid & (jnp.abs(touch.travel) < least), valid
+    return term, strength, valid & (jnp.abs(touch.travel) < least), valid, found.rate
 
 
 def with_run_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:

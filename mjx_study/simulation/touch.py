@@ -18,6 +18,9 @@ TOUCHING_SHARE: Final = 1e-6
 """Share of a cell: a body closer than this before the step was already touching, so there is no onset."""
 NEAR_TOUCH: Final = 0.1
 """Share of the way from the touch to the state in contact at which the contact's geometry is evaluated."""
+CHATTER: Final = 2.2
+"""Time between two events of a contact below which they belong together, in the time that contact takes to slow a body
+down, 1 / `guards.relaxation_rate`: a little more than `solref`'s time constant where damping is critical."""
 
 
 Flags = Bool[Array, " slots"]
@@ -31,7 +34,7 @@ class OnsetCounts:
     Attributes:
         found: onsets of contacts and limits, and missed events.
         bounded: onsets and ends at grazing speed, whose term is bounded.
-        missed: events left uncorrected for lack of slots.
+        missed: events left uncorrected, for lack of slots or because their contact chatters (`Events.chattering`).
         strength: root-mean-square share of the approach speed that a corrected onset removes in one step, by the force
             at touch or by the spring at the depth of a step, h^2 k d, whichever is more; 0 if there is none, and with
             the jump, whose error does not depend on it.
@@ -76,15 +79,31 @@ class Events:
     touching: Bool[Array, "*slots guards"]
     used: Bool[Array, "*slots"]
 
+    def chattering(self, rate: Float[Array, " slots"], timestep: float | Scalar) -> Flags:
+        """Events of contacts that begin and end again and again: in a row of three or more, each soon after the last.
+
+        The derivatives of such a row multiply by about n^T dq / D at each event, and so does the variance of the term.
+
+        Args:
+            rate: relaxation rate of each event's contact [1/s].
+        """
+        apart = self.step[None] - self.step[:, None]
+        near = (self.guard[None] == self.guard[:, None]) & (jnp.abs(apart) * timestep * rate[:, None] < CHATTER)
+        near = near & self.used[None] & self.used[:, None]
+        between = jnp.any(near & (apart < 0), axis=1) & jnp.any(near & (apart > 0), axis=1)
+        return jnp.any(near & between[None], axis=1)
+
     def counts(
         self,
         past: "Past",
         valid: Flags,
         narrow: Flags,
         strength: Float[Array, " slots"],
+        chatters: Flags,
     ) -> OnsetCounts:
         """Counts of a rollout, from what is known at its end and from what the term says of these events."""
-        missed = past.events - jnp.sum(self.used)
+        missed = past.events - jnp.sum(self.used) + jnp.sum(valid & chatters)
+        valid, narrow = valid & ~chatters, narrow & ~chatters
         begins = valid & ~self.ends
         onsets = jnp.sum(begins)
         first = jnp.min(jnp.where(begins, self.step.astype(strength.dtype), jnp.inf), initial=jnp.inf)
