@@ -223,7 +223,7 @@ def test_rows_of_events_of_one_contact_are_told(
     """Steps of 2 ms, and contact that relaxes in 10 ms: up to ten steps apart is soon."""
     number, none = len(steps), jnp.zeros((len(steps), 2), bool)
     ends = jnp.arange(number) % 2 == 1
-    at = jnp.array(steps), jnp.array(guards_at)
+    at = jnp.array(steps, jnp.int32), jnp.array(guards_at)
     events = Events(*at, ends, ends, none, none, jnp.arange(number) < used)
     np.testing.assert_array_equal(events.chattering(jnp.full(number, 100.0), 2e-3), np.array(chatter, bool))
 

@@ -124,7 +124,8 @@ def corrected(
     First derivatives with respect to initial state and controls, in forward and reverse mode.
 
     Args:
-        model: the model to step; may be traced, but not differentiated (TypeError).
+        model: the model to step; may be traced, but not differentiated (TypeError); `drop_in.step` has derivatives
+            over it.
         slots: maximum number of events to correct, earliest first; by default `slots_for` the scene.
         weight: factor of the term; 0 gives the derivatives of `dynamics.simulated`.
     """
@@ -477,4 +478,7 @@ def without_derivative(model: mjx.Model) -> mjx.Model:
     return whole(_of_states_only(traced))
 
 
-_of_states_only = refusing("the onset term has derivatives over states and controls, but not over the model")
+_of_states_only = refusing(
+    "the onset term of rollouts has derivatives over states and controls, but not over the model: "
+    'mjx_study.step(model, data, onset="linear") has both'
+)

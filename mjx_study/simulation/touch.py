@@ -22,6 +22,9 @@ CHATTER: Final = 2.2
 """Time between two events of a contact below which they belong together, in the time that contact takes to slow a body
 down, 1 / `guards.relaxation_rate`: a little more than `solref`'s time constant where damping is critical."""
 
+LONG_AGO: Final = 1_000_000
+"""Steps before the first event of a contact."""
+
 
 Flags = Bool[Array, " slots"]
 
@@ -87,11 +90,32 @@ class Events:
         Args:
             rate: relaxation rate of each event's contact [1/s].
         """
-        apart = self.step[None] - self.step[:, None]
-        near = (self.guard[None] == self.guard[:, None]) & (jnp.abs(apart) * timestep * rate[:, None] < CHATTER)
-        near = near & self.used[None] & self.used[:, None]
-        between = jnp.any(near & (apart < 0), axis=1) & jnp.any(near & (apart > 0), axis=1)
-        return jnp.any(near & between[None], axis=1)
+        guards = jnp.arange(self.absent.shape[-1])
+        own = lambda here, every: jnp.sum(jnp.where(here, every, 0), dtype=every.dtype)  # noqa: E731
+
+        def forwards(carry: tuple[Array, Array], event: tuple[Array, ...]) -> tuple[Any, Array]:
+            """Number of an event in its row."""
+            last, numbers = carry
+            step, guard, used, rate = event
+            here = (guards == guard) & used
+            soon = (step - own(here, last)) * timestep * rate < CHATTER
+            number = jnp.where(soon, own(here, numbers), 0) + 1
+            return (jnp.where(here, step, last), jnp.where(here, number, numbers)), number
+
+        def backwards(carry: tuple[Array, Array], event: tuple[Array, ...]) -> tuple[Any, Array]:
+            """Length of its row, which the next event of the contact continues if it has the next number."""
+            following, lengths = carry
+            number, guard, used = event
+            here = (guards == guard) & used
+            continued = own(here, following) == number + 1
+            length = jnp.where(continued, own(here, lengths), number)
+            return (jnp.where(here, number, following), jnp.where(here, length, lengths)), length
+
+        zeros = jnp.zeros(len(guards), self.step.dtype)
+        events = self.step, self.guard.astype(zeros.dtype), self.used, rate
+        _, number = jax.lax.scan(forwards, (zeros - LONG_AGO, zeros), events)
+        _, length = jax.lax.scan(backwards, (zeros, zeros), (number, *events[1:3]), reverse=True)
+        return self.used & (length >= 3)
 
     def counts(
         self,
