@@ -18,6 +18,8 @@ TOUCHING_SHARE: Final = 1e-6
 """Share of a cell: a body closer than this before the step was already touching, so there is no onset."""
 NEAR_TOUCH: Final = 0.1
 """Share of the way from the touch to the state in contact at which the contact's geometry is evaluated."""
+LEAST: Final = 8
+"""Number of events of a contact in a row from which it chatters: a ball in a corner rarely has as many."""
 CHATTER: Final = 2.2
 """Time between two events of a contact below which they belong together, in the time that contact takes to slow a body
 down, 1 / `guards.relaxation_rate`: a little more than `solref`'s time constant where damping is critical."""
@@ -83,7 +85,7 @@ class Events:
     used: Bool[Array, "*slots"]
 
     def chattering(self, rate: Float[Array, " slots"], timestep: float | Scalar) -> Flags:
-        """Events of contacts that begin and end again and again: in a row of three or more, each soon after the last.
+        """Events of contacts that begin and end again and again: in a row of `LEAST` or more, each soon after the last.
 
         The derivatives of such a row multiply by about n^T dq / D at each event, and so does the variance of the term.
 
@@ -115,7 +117,7 @@ class Events:
         events = self.step, self.guard.astype(zeros.dtype), self.used, rate
         _, number = jax.lax.scan(forwards, (zeros - LONG_AGO, zeros), events)
         _, length = jax.lax.scan(backwards, (zeros, zeros), (number, *events[1:3]), reverse=True)
-        return self.used & (length >= 3)
+        return self.used & (length >= LEAST)
 
     def counts(
         self,
