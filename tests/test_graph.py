@@ -196,6 +196,45 @@ def test_what_does_not_change_in_a_loop_is_computed_before_it(monkeypatch):
     assert "cosh" not in str(loop.params["body_jaxpr"])
 
 
+def _one_term(x):
+    """A sum of which constants leave one term, which is -0 where the sum is 0."""
+    return jnp.sum(jnp.zeros(3).at[1].set(-x))
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: jnp.minimum(1 / (0.5 * _one_term(x)), 1e6),
+        lambda x: jnp.arctan2(jnp.zeros(3).at[0].set(-1.0) @ jnp.stack([x, x, x]), -1.0 - x),
+        lambda x: jax.lax.integer_pow(jnp.where(x < 1, _one_term(x), 2.0), -3),
+        lambda x: jax.lax.rsqrt(_one_term(x)),
+    ],
+    ids=["quotient", "angle", "power", "root"],
+)
+def test_a_sum_of_zeros_is_not_negative(function, native, monkeypatch):
+    monkeypatch.setenv(SWITCH, native)
+    points = jnp.array([0.0, -0.0, -0.7])
+    found, slopes = jax.jit(jax.vmap(jax.value_and_grad(lambda x: unrolled(function, x))))(points)
+    np.testing.assert_allclose(found, jax.vmap(function)(points), rtol=1e-12)
+    np.testing.assert_allclose(slopes[2], jax.grad(function)(points[2]), rtol=1e-12)
+
+
+def test_values_alone_can_be_too_large(monkeypatch):
+    """A call with its own derivative is one operation, unless only values are wanted."""
+    for most in scalars.MOST_SCALARS, scalars.MOST_NATIVE:
+        monkeypatch.setitem(most, "cpu", 9)
+
+    @jax.custom_jvp
+    def long(x):
+        return jnp.stack([jnp.sin(at * x) for at in range(50)]).sum()
+
+    long.defjvp(lambda at, by: (long(*at), 7 * by[0]))
+    value, slope = jax.value_and_grad(lambda x: unrolled(lambda y: 2 * long(y), x))(0.3)
+    np.testing.assert_allclose(value, 2 * long(0.3), rtol=1e-12)
+    assert slope == 14
+
+
 def test_a_constant_zero_times_infinity_is_zero():
     assert jax.jit(lambda x: unrolled(lambda y: jnp.asarray([0.0, 1.0]) * y, x))(jnp.inf).tolist() == [0.0, np.inf]
 

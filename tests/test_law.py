@@ -18,6 +18,8 @@ from mjx_study import cli
 from mjx_study.bench import plan_bench, run_bench
 from mjx_study.choices import laws_of
 from mjx_study.execution.run import run_study
+from mjx_study.graph import scalars
+from mjx_study.graph.native import SWITCH
 from mjx_study.objective import rollout_cost
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.simulation import dynamics
@@ -122,6 +124,18 @@ def test_a_sweep_over_laws_resumes_to_the_same_numbers(tmp_path: Path) -> None:
     assert again.attrs["computed_cells"] == 2
     for name in ("variance", "gradient_norm", "relative_error", "residual"):
         np.testing.assert_array_equal(again[name], whole[name])
+
+
+@pytest.mark.parametrize("most", [9, 20_000], ids=["as it is", "as a graph"])
+def test_a_timestep_may_be_a_number(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", most)
+    advance = stepping(ball(), "kelvin_voigt", 2000.0)
+    scene, model = advance.args
+    start = study.initial_state(scene, scene.template.qpos.at[2].set(0.2))
+    shorter = model.replace(opt=model.opt.replace(timestep=5e-4))
+    fallen = jax.jit(lambda state: step(scene, shorter, state, jnp.zeros(0))[0].qvel[2])(start)
+    assert float(fallen) == pytest.approx(-9.81 * 5e-4, rel=0.01)  # a rounded force acts at a distance
 
 
 @pytest.mark.parametrize("law", ["kelvin_voigt", "conic"])

@@ -27,7 +27,8 @@ def tables(found: Cells) -> dict[str, str]:
     matrix = [markdown_row("engine", "differentiated in", *SCENES), "|---" * (len(SCENES) + 2) + "|"]
     for name, engine in ENGINES.items():
         rows = [[found.get((name, scene, step)) for step in TIMESTEPS] for scene in SCENES]
-        matrix.append(markdown_row(engine.label, engine.how, *map(combined, rows)))
+        verdicts = (combined(row).replace("right", "**right**") for row in rows)
+        matrix.append(markdown_row(engine.label, engine.how, *verdicts))
     return {"matrix": "\n".join(matrix), "reasons": _reasons(found)} | {each: _numbers(found, each) for each in SCENES}
 
 

@@ -39,6 +39,10 @@ _OTHERS: Final = (
     *("shift_left", "shift_right_logical", "sign", "sin", "sinh", "tan", "tanh", "xor"),
 )
 ELEMENTWISE: Final = frozenset((*_NUMPY, *_OTHERS))
+_OF_SIGNED_ZEROS: Final = frozenset({"atan2", "div", "integer_pow", "pow", "rsqrt"})
+"""Operations that take 0 and -0 to numbers far apart; a quotient only below the line."""
+_KEEPS_SIGNED_ZEROS: Final = frozenset({"div", "max", "min", "mul", "neg", "select_n", "sqrt"})
+"""Operations whose result may be -0 because an argument is."""
 _COMMUTATIVE: Final = frozenset({"add", "add_any", "and", "eq", "max", "min", "mul", "ne", "or"})
 
 
@@ -86,6 +90,8 @@ class ScalarGraph:
         self.arrays: dict[int, int] = {}
         self.called = 0
         self._known: dict[Any, Node] = {}
+        self._sums: set[int] = set()
+        self._from_zero: dict[int, Any] = {}
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:
         self._count += 1
@@ -109,6 +115,10 @@ class ScalarGraph:
         name = primitive.name
         if not any(isinstance(each, Node) for each in arguments):
             return _folded(primitive, arguments, dtype, parameters)
+        if name in _OF_SIGNED_ZEROS and dtype.kind == "f":
+            first, *others = arguments
+            first = first if name == "div" else self._signed(first)
+            arguments = first, *map(self._signed, others)
         if (simpler := self._simpler(name, arguments, dtype)) is not None:
             return simpler
         if name in _COMMUTATIVE:
@@ -150,6 +160,26 @@ class ScalarGraph:
                 return a
         return None
 
+    def _signed(self, value: Any) -> Any:
+        """Return a value, 0 instead of -0 where it is a sum, also in the products that it is made of.
+
+        Sums begin with 0, and so are never -0. Graphs leave out that 0, which only makes a difference to `1 / x`.
+        """
+        if not isinstance(value, Node):
+            return value
+        if value.number not in self._from_zero:
+            found = value
+            if value.number in self._sums:
+                differs = self.scalar(lax.ne_p, (value, value), np.dtype(bool))  # never, but no compiler knows
+                zero = self.scalar(lax.convert_element_type_p, (differs,), value.dtype, **_conversion(value.dtype))
+                found = self.scalar(lax.add_p, (value, zero), value.dtype)
+            elif getattr(value.operation, "name", None) in _KEEPS_SIGNED_ZEROS:
+                arguments = tuple(map(self._signed, value.arguments))
+                if any(one is not other for one, other in zip(arguments, value.arguments, strict=True)):
+                    found = self.scalar(value.operation, arguments, value.dtype, **value.parameters)
+            self._from_zero[value.number] = found
+        return self._from_zero[value.number]
+
     def elementwise(self, primitive: Any, inputs: Sequence[np.ndarray], aval: Any, **parameters: Any) -> np.ndarray:
         spread = [np.broadcast_to(each, aval.shape).flat for each in inputs]
         entries = zip(*spread, strict=True)
@@ -174,6 +204,9 @@ class ScalarGraph:
         result = rows[..., 0]
         for at in range(1, rows.shape[-1]):
             result = self.elementwise(primitive, [result, rows[..., at]], aval)
+        if primitive is lax.add_p and rows.shape[-1] > 1 and aval.dtype.kind == "f":
+            computed = (each for each in result.flat if isinstance(each, Node) and each.arguments)
+            self._sums.update(each.number for each in computed if _may_be_minus_zero(each))
         return result
 
 
@@ -194,6 +227,24 @@ def filled(shape: tuple[int, ...], entries: Iterable[Any]) -> np.ndarray:
 @no_type_check
 def entries_of(arrays: Iterable[np.ndarray]) -> list[Any]:
     return [each for array in arrays for each in array.flat]
+
+
+@no_type_check
+def _may_be_minus_zero(value: Any) -> bool:
+    """Whether a sum or a term of it may be -0; squares are not, nor sums with them."""
+    if not isinstance(value, Node):
+        return bool(value == 0 and np.signbit(value))
+    match getattr(value.operation, "name", None):
+        case "add" | "add_any":
+            return all(map(_may_be_minus_zero, value.arguments))
+        case "mul":
+            return value.arguments[0] is not value.arguments[1]
+        case name:
+            return name not in ("abs", "square")
+
+
+def _conversion(dtype: Any) -> dict[str, Any]:
+    return {"new_dtype": dtype, "weak_type": False, "sharding": None}
 
 
 @no_type_check

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any, Final
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_study.simulation._mjx import mjx
@@ -248,10 +249,11 @@ def _prepared(scene: Scene, law: Law) -> tuple[Any, Any]:
 
 
 def _with_arrays_of(theirs: Any, ours: Any) -> Any:
-    """A model or its options with the arrays that another has by the same name, but for budgets."""
+    """A model or its options with the arrays and numbers that another has by the same name, but for budgets."""
     found = {}
     for field in dataclasses.fields(theirs):
         own, other = getattr(theirs, field.name), getattr(ours, field.name, None)
-        if isinstance(own, jax.Array) and isinstance(other, jax.Array) and field.name not in BUDGET:
-            found[field.name] = other
+        given = isinstance(other, jax.Array | np.ndarray | float)
+        if isinstance(own, jax.Array) and given and field.name not in BUDGET:
+            found[field.name] = jnp.asarray(other)
     return theirs.replace(**found)

@@ -7,7 +7,7 @@ from experiments.engines.adapters.jax_common import batched
 from experiments.engines.scenes import Scene, Simulate, mjcf, mjcf_index, mjcf_state
 
 SPIN = 1e-6
-"""Angular velocity at the start of `generalized` [rad/s], whose derivative at rest is NaN."""
+"""Angular velocity of every body at the start of `generalized` [rad/s], whose derivative at rest is NaN."""
 
 
 def build(scene: Scene, timestep: float, variant: str) -> Simulate:
@@ -17,7 +17,7 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
     is_velocity, index = mjcf_index(scene)
     qpos, qvel = mjcf_state(scene, scene.center)
     if variant == "generalized" and len(qpos) > 1:
-        qvel[3:6] = SPIN
+        qvel.reshape(-1, 6)[:, 3:] = SPIN
 
     def final_positions(jax, theta):
         jnp = jax.numpy

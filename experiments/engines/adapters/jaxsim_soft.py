@@ -4,6 +4,7 @@ Its default of 1 mm is not resolved by the steps of the study. A sphere is 50 po
 knows no walls: a scene with one is turned, so that the wall becomes the ground.
 """
 
+import math
 from importlib import import_module
 from typing import Any
 
@@ -25,9 +26,12 @@ MODEL = """<sdf version="1.7"><model name="body"><link name="body"><inertial><ma
 def build(scene: Scene, timestep: float, variant: str) -> Simulate:
     """Return rollouts; `variant` is the integrator's name."""
     api: Any = import_module("jaxsim.api")
-    (shape, tilt), *others = ((body.shape, body.tilt) for body in scene.bodies)
-    if others or tilt or shape not in ("sphere", "box"):
-        raise CannotError("this adapter builds one sphere or one level box alone")
+    first, *others = scene.bodies
+    shape = first.shape
+    if others:
+        raise CannotError("its bodies touch the ground, and not each other")
+    if shape not in SHAPES:
+        raise CannotError("this adapter builds no joint")
     model = api.model.JaxSimModel.build_from_model_description(
         model_description=MODEL.format(*SHAPES[shape]),
         time_step=timestep,
@@ -55,6 +59,7 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
         state = api.data.JaxSimModelData.build(
             model=model,
             base_position=turned(*body.position, wall),
+            base_quaternion=jnp.array([math.cos(first.tilt / 2), 0.0, math.sin(first.tilt / 2), 0.0]),
             base_linear_velocity=turned(*body.velocity, 0.0),
         )
         last, _ = jax.lax.scan(
