@@ -2,7 +2,8 @@
 smooth collisions and contacts from a distance, without its substeps, each of which is a step of a smaller timestep.
 
 Rollouts are batched by `torch.vmap`, as its documentation has it. There its loops, of a number of iterations that
-depends on the data, take 1.5 s a step; so the numbers are fixed at `ITERATIONS`, which leave values and derivatives.
+depends on the data, take 1.5 s a step; so the numbers are fixed at `ITERATIONS`: where spheres do not slip values are
+MJX's, and on the toss derivatives are off at a tenth of the points, at none with 10 iterations.
 """
 
 from importlib import import_module
