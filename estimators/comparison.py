@@ -1,9 +1,11 @@
 """Distance of an estimate from a reference or from another, and how much of its mean rare events carry."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators.batches import GradientEstimate
@@ -13,6 +15,7 @@ from estimators.samples import finite_rows
 from estimators.statistics import summarise
 
 Scalar = Float[Array, ""]
+Means = Array | np.ndarray
 
 
 @register_pytree
@@ -192,13 +195,14 @@ def _multiplied(
     return means / jnp.maximum(cube_root, 1e-2) ** 1.5
 
 
-def squared_bias_of_means(means: Float[Array, "batches params"], reference: GradientEstimate) -> tuple[Scalar, Scalar]:
+def squared_bias_of_means(means: Float[Means, "batches params"], reference: GradientEstimate) -> tuple[Any, Any]:
     """Estimate ||E gbar - E g||^2 without bias from the means of independent batches of any estimator.
 
         sum_{i != j} d_i^T d_j / (S (S - 1)) - sum_k se_k^2,   d_i = gbar_i - reference, se its standard error
 
     Products of different batches are free of the noise of the means; the second term removes the noise of the
-    reference, which all share. The estimate may be negative if the bias is below the noise.
+    reference, which all share. The estimate may be negative if the bias is below the noise. With NumPy's arrays, in the
+    reference too, nothing is compiled.
 
     Args:
         means: Means of S >= 3 batches, [cost/param].
@@ -208,19 +212,17 @@ def squared_bias_of_means(means: Float[Array, "batches params"], reference: Grad
         The estimate and its standard error, [cost^2/param^2]. The error combines a jackknife over the batches with the
         largest contribution of the reference: twice the bias times its error, plus its squared error. NaN for S < 3.
     """
-    count = means.shape[0]
+    numpy, count = means.__array_namespace__(), means.shape[0]
     if count < 3:
-        undefined = jnp.full((), jnp.nan, means.dtype)
-        return undefined, undefined
+        return (numpy.full((), numpy.nan, means.dtype),) * 2
     gaps = means - reference.mean[None, :]
-    products = jnp.matmul(gaps, gaps.T, precision="highest")
-    others = products - jnp.diag(jnp.diag(products))
-    noise = jnp.sum(reference.standard_error**2)
-    value = jnp.sum(others) / (count * (count - 1)) - noise
-    without = (jnp.sum(others) - 2 * jnp.sum(others, axis=1)) / ((count - 1) * (count - 2)) - noise
-    own = (count - 1) / count * jnp.sum((without - jnp.mean(without)) ** 2)
-    shared = 2 * jnp.sqrt(jnp.maximum(value, 0.0) * noise) + noise
-    return value, jnp.hypot(jnp.sqrt(own), shared)
+    others = numpy.sum(gaps * (numpy.sum(gaps, axis=0)[None, :] - gaps), axis=1)  # sum of d_i^T d_j over all j but i
+    noise = numpy.sum(reference.standard_error**2)
+    value = numpy.sum(others) / (count * (count - 1)) - noise
+    without = (numpy.sum(others) - 2 * others) / ((count - 1) * (count - 2)) - noise
+    own = (count - 1) / count * numpy.sum((without - numpy.mean(without)) ** 2)
+    shared = 2 * numpy.sqrt(numpy.maximum(value, 0.0) * noise) + noise
+    return value, numpy.hypot(numpy.sqrt(own), shared)
 
 
 @register_pytree

@@ -217,7 +217,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples: int, devices: Any):
     """Largest batch, by halving, whose gradients through `mjx.step` fit in memory, with the programs."""
     while True:
-        value, gradient = _stock_programs(task, contact, keys[:samples], devices)
+        value, gradient = stock_programs(task, contact, keys[:samples], devices)
         try:
             jax.block_until_ready(gradient())
         except jax.errors.JaxRuntimeError as error:
@@ -228,7 +228,7 @@ def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples:
             return samples, value, gradient
 
 
-def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices: Any) -> tuple[Callable[[], Any], ...]:
+def stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices: Any) -> tuple[Callable[[], Any], ...]:
     """Programs for costs and gradients of the same samples through `mjx.step`, spread like this project's."""
     scene, policy = task.scene, task.policy
     dtype = scene.template.qpos.dtype

@@ -1,5 +1,6 @@
 """Process-wide settings: precision, devices, compilation cache. Applied by an explicit call, never on import."""
 
+import ctypes
 import functools
 import hashlib
 import os
@@ -20,6 +21,8 @@ from mjx_study.version import version_of
 
 _TRACES: Final[list[Path]] = []
 _CORES: Final[list[int]] = []
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _KEPT = -1, -3, 1 << 30
+"""Parameters of `mallopt`, and their value [bytes]."""
 _POOL: Final = "PJRT_NPROC"
 """Environment variable with the size of XLA's thread pools; read when JAX sets up its devices."""
 
@@ -52,6 +55,7 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if not _CORES and jax.default_backend() == "cpu":
         _shrink_pool()
+    _keep_memory()
     _CORES[:] = [cores]
     _keep_programs(cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -83,6 +87,18 @@ def print_warning(message: str) -> None:
     """Print a warning of MuJoCo's on standard error, if anybody reads it."""
     with suppress(OSError, AttributeError):
         print(f"MuJoCo: {message}", file=sys.stderr)
+
+
+def _keep_memory() -> None:
+    """Have glibc keep up to `_KEPT` bytes of freed memory.
+
+    XLA allocates a program's temporary arrays at every call. The system would take back those of 32 MB or more, and
+    clear them page by page at the next call.
+    """
+    with suppress(OSError, AttributeError):
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_TRIM_THRESHOLD, _KEPT)
+        libc.mallopt(_MMAP_THRESHOLD, _KEPT)
 
 
 def _shrink_pool() -> None:

@@ -44,7 +44,7 @@ def test_stock_mjx_runs_the_same_samples() -> None:
     task = make_task("tennis", horizon=5).replace(noise="laplace")
     (cell,), _ = family_grid(task, ["mujoco"], [4000.0])
     keys = jax.random.split(jax.random.key(0), 4)
-    values, _ = bench._stock_programs(task, cell.contact, keys, local_devices())
+    values, _ = bench.stock_programs(task, cell.contact, keys, local_devices())
     ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, jax.random.clone(keys))
     np.testing.assert_allclose(values(), ours.value, rtol=1e-10)
 

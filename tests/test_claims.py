@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 
 from mjx_study import cli
 from mjx_study.claims import CLAIMS, NUM_VERDICTS
 from mjx_study.claims.claim import Claim, Criterion, above, below
 from mjx_study.claims.laboratory import EFFORTS, FAMILIES, Laboratory, Statistic, exact, mean_of, ratio_of, share_of
 from mjx_study.claims.ledger import deciding_size, interval_of, measure_ledger
-from mjx_study.claims.page import COLOURS, draw_matrix, markdown, matrix_lines
+from mjx_study.claims.page import markdown, matrix_lines
 
 ROOT = Path(__file__).parents[1]
 FULL, QUICK = (ROOT / "experiments" / "data" / f"{name}.json" for name in ("claims", "claims_quick"))
@@ -161,13 +160,6 @@ def test_the_page_names_the_claims_that_the_quick_ledger_decides_otherwise() -> 
     revised = {claim for claim, quick, full in verdicts if quick != "undecided" and quick != full}
     assert {part for part in page.split("`") if part in CLAIMS} == revised
     assert page.startswith(f" {[quick for _, quick, _ in verdicts].count('undecided')} verdicts undecided")
-
-
-def test_the_picture_has_a_strip_for_each_verdict() -> None:
-    (axes,) = draw_matrix(json.loads(FULL.read_text())).axes
-    drawn = [to_hex(patch.get_facecolor()).upper() for patch in axes.patches]
-    assert sorted(drawn) == sorted(COLOURS[each["verdict"]] for _, each in evidence_of(FULL))
-    assert [label.get_text() for label in axes.get_yticklabels()] == list(CLAIMS)
 
 
 def test_commands_and_families_exist(capsys: pytest.CaptureFixture[str]) -> None:

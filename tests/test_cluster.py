@@ -51,8 +51,17 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset:
     return run_study(config(*STIFFNESSES), tmp_path_factory.mktemp("study"))
 
 
-def test_a_killed_worker_costs_its_cell_and_nothing_else(workers: Any, undisturbed: xr.Dataset, tmp_path: Path) -> None:
-    """By SIGKILL, as soon as a cell is there; the numbers are those of a run in this process, to the bit."""
+@pytest.mark.parametrize(
+    ("asked", "cells"),
+    [
+        pytest.param(config(*STIFFNESSES), len(STIFFNESSES), id="cells"),
+        pytest.param(config(SLOW, samples=(96,), block_size=8), 1, id="blocks", marks=pytest.mark.slow),
+    ],
+)
+def test_a_killed_worker_costs_its_unit_and_nothing_else(
+    workers: Any, undisturbed: xr.Dataset, tmp_path: Path, asked: StudyConfig, cells: int
+) -> None:
+    """By SIGKILL, after the first unit; the numbers are those of a run in this process, to the bit."""
     killed: list[int] = []
 
     def kill(done: int, total: int, what: str) -> None:
@@ -60,11 +69,12 @@ def test_a_killed_worker_costs_its_cell_and_nothing_else(workers: Any, undisturb
             killed.append(min(workers.run(os.getpid).values()))
             os.kill(killed[0], signal.SIGKILL)
 
-    found = run_study(config(*STIFFNESSES), tmp_path, kill, cluster=workers)
+    found, expected = run_study(asked, tmp_path, kill, cluster=workers), undisturbed if cells > 1 else run_study(asked)
     assert killed and killed[0] not in workers.run(os.getpid).values()
-    assert found.attrs["computed_cells"] == len(STIFFNESSES) and found.attrs["missing_cells"] == 0
-    assert same(found, undisturbed) and same(load_study(tmp_path), undisturbed)
-    assert run_study(config(*STIFFNESSES), tmp_path, cluster=workers).attrs["computed_cells"] == 0
+    assert found.attrs["computed_cells"] == cells and found.attrs["missing_cells"] == 0
+    assert same(found, expected) and same(load_study(tmp_path), expected)
+    assert not list(tmp_path.glob("cells/*.part.npz"))
+    assert run_study(asked, tmp_path, cluster=workers).attrs["computed_cells"] == 0
 
 
 def test_a_poisonous_cell_fails_and_the_rest_goes_on(workers: Any, tmp_path: Path) -> None:
@@ -182,26 +192,6 @@ def sweep(folder: Path, address: str = "local:2", **variables: str) -> subproces
     command = [sys.executable, "-m", "mjx_study", "sweep", *ARGUMENTS, "--cluster", address, "--output", str(folder)]
     environment = os.environ | {ACCOUNT: str(folder)} | variables
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-
-
-@pytest.mark.slow
-def test_a_killed_client_goes_on_to_the_same_data(undisturbed: xr.Dataset, tmp_path: Path) -> None:
-    """The command itself, killed by SIGKILL after its second cell: its workers end, a second run computes the rest."""
-    folder = tmp_path / "out"
-    running = sweep(folder)
-    while len(list(folder.glob("cells/*.npz"))) < 2:
-        assert running.poll() is None, running.communicate()[1]
-        time.sleep(0.05)
-    children = psutil.Process(running.pid).children(recursive=True)
-    running.send_signal(signal.SIGKILL)
-    running.communicate()
-    assert not psutil.wait_procs(children, timeout=60)[1], "its workers live on"
-    assert 2 <= len(STIFFNESSES) - len(Store.open(folder).missing) < len(STIFFNESSES)
-    last = sweep(folder)
-    said, errors = last.communicate()
-    assert last.returncode == 0, errors
-    assert "distributed" not in errors and f"computed {len(STIFFNESSES)}" not in said
-    assert same(load_study(folder), undisturbed)
 
 
 @contextmanager

@@ -145,7 +145,7 @@ def filling(full: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("optimise pusher --horizon 8 --iterations 2 --evaluation-samples 5 --estimators fobg", "FoBG", "runs"),
         ("compare pusher --stiffness 10 --horizon 4 --reference-samples 8", "ZoBG", "rows"),
-        ("landscape ball_wall --points 3", "where the mean cost is least", "curves"),
+        ("landscape ball_wall --points 3", "least mean cost", "curves"),
     ],
 )
 def test_a_full_disk_costs_no_number(

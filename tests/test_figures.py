@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from estimators import ESTIMATORS
 from mjx_study._matplotlib import matplotlib
 from mjx_study.plots.edges import UNDRAWN
-from mjx_study.plots.panels import UNSTABLE, counted
+from mjx_study.plots.panels import UNSTABLE
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import STYLES, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report
@@ -203,7 +203,6 @@ def test_achieved_costs_are_above_one_baseline_and_none_is_drawn_at_it() -> None
     assert axes.get_ylim()[1] == pytest.approx(3 * (9 + 4 - 3))
     assert "3" in axes.get_ylabel().split()[-1] and "lowest" in axes.get_ylabel()
     assert figure.get_suptitle().endswith("(1 seed)")
-    assert counted(10, "seed") == "10 seeds"
 
 
 def test_unstable_steps_are_shown_wherever_the_axis_is_stiffness() -> None:

@@ -130,7 +130,8 @@ def test_every_model_gets_a_task(name: str, begin: Callable[..., tuple[Task, dic
         assert len(set(task.defaults.stiffnesses)) == 4 and high >= 5 * low
         assert 0.3 < task.scene.timestep * math.sqrt(high / effective_mass(task.scene, *task.contact_pair)) < 0.8
     found = propose(load_scene(written.with_name(f"{name}.xml")))
-    misses = [found.aim.misses(trial, found.horizon) for trial in proposal._trials(found.drive, found.horizon)[0]]
+    moves = (way * np.full((1, found.drive.size), found.drive.scale) for way in (-1, 1))
+    misses = [found.aim.misses(proposal.run_trial(found.drive, move, found.horizon), found.horizon) for move in moves]
     assert np.std(misses) > 0 and all(math.isfinite(each) for each in misses)
     ruff = [sys.executable, "-m", "ruff", "--isolated", "--quiet"]
     settings = ["--line-length", "120", "-"]

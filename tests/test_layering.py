@@ -148,13 +148,6 @@ def test_a_cycle_is_found() -> None:
     assert cycle({"a": {"a"}}) == ["a"]
 
 
-def test_every_layer_is_used_once_and_files_are_found() -> None:
-    assert len(set(LAYERS)) == len(LAYERS)
-    assert {layer_of(module_of(path)) for path in FILES} >= {
-        LAYERS.index(n) for n in ("estimators", "mjx_study.simulation")
-    }
-
-
 @pytest.mark.parametrize(
     ("module", "source", "wrong"),
     [
@@ -187,19 +180,9 @@ def test_no_function_hides_its_module(path: Path) -> None:
     assert namesakes(module_of(path), path.read_text()) <= {STABLE, *BUILDERS}
 
 
-@pytest.mark.parametrize(
-    ("module", "found"),
-    [
-        ("mjx_study.report", {"mjx_study.report.report"}),
-        ("mjx_study.report.page", {"mjx_study.report.page.report"}),
-        ("mjx_study.page", set()),
-    ],
-)
-def test_namesakes_are_found(module: str, found: set[str]) -> None:
-    assert namesakes(module, "class Report: ...\ndef report(): ...\ndef _page(): ...") == found
-
-
-def test_a_module_in_no_layer_fails() -> None:
+def test_namesakes_and_missing_layers_are_found() -> None:
+    source = "class Report: ...\ndef report(): ...\ndef _page(): ..."
+    assert namesakes("mjx_study.report.page", source) == {"mjx_study.report.page.report"}
     with pytest.raises(LookupError, match="mjx_study.surprise is in no layer"):
         layer_of("mjx_study.surprise")
 

@@ -1,8 +1,9 @@
-"""Relative links of pages and notebooks lead to a file and a heading of the project, and names of modules exist."""
+"""Relative links lead to a file and a heading, names of modules exist, and no merge is left unfinished."""
 
 import os
 import pkgutil
 import re
+import subprocess
 from pathlib import Path
 
 import nbformat
@@ -52,3 +53,10 @@ def test_a_dead_link_is_found() -> None:
 def test_modules_and_names_exist(page: Path) -> None:
     for name in re.findall(r"`((?:mjx_study|estimators)(?:\.\w+)+)(?:\(.*?\))?`", prose(page)):
         assert pkgutil.resolve_name(name) is not None
+
+
+def test_no_file_has_a_conflict_marker() -> None:
+    found = subprocess.run(
+        ["git", "grep", "-I", "--name-only", f"^{7 * '<'} "], cwd=ROOT, capture_output=True, text=True
+    )
+    assert (found.returncode, found.stdout) in ((1, ""), (128, ""))  # nothing found, or not a checkout

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import pytest
 
 from estimators import make_estimator
-from mjx_study import gradcheck
 from mjx_study.cli import main
-from mjx_study.diagnose.means import MeanCheck, check_mean, lines_of, term_lines
+from mjx_study.diagnose.means import check_mean, lines_of, term_lines
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 
@@ -24,12 +23,6 @@ def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> N
     assert corrected.verdict == "right"
     assert 2 * corrected.circulation.half_width < 0.05 * abs(corrected.circulation.difference)
     assert len(lines_of([plain, corrected])) >= 3
-
-
-def test_checks_of_means_are_importable_from_gradcheck() -> None:
-    assert gradcheck.check_mean is check_mean and gradcheck.MeanCheck is MeanCheck
-    with pytest.raises(AttributeError, match="module 'mjx_study.gradcheck' has no attribute 'check_median'"):
-        _ = gradcheck.check_median
 
 
 def test_estimators_take_their_options(capsys: pytest.CaptureFixture[str]) -> None:

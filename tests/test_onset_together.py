@@ -14,7 +14,7 @@ import pytest
 from mjx_study import InitialStatePolicy, Task
 from mjx_study.experiment.quadrature import grid, means
 from mjx_study.objective.cost import rollout_cost
-from mjx_study.simulation import constraint, guards
+from mjx_study.simulation import constraint, guards, touch
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.drop_in import step
@@ -140,11 +140,13 @@ def test_jumps_of_a_step_add_up_whatever_their_order() -> None:
     assert np.all(np.abs(expected).max(axis=1) > 0.04)
 
 
-def slope_and_mean(hinge: str, onset: str) -> tuple[float, float, np.ndarray]:
+def slope_and_mean(hinge: str, onset: str, feet: str = "") -> tuple[float, float, np.ndarray]:
     """Slope of the mean cost of a box thrown along a floor, the mean of the corrected derivatives, both by quadrature,
-    and numbers of events: all, without a slot, replaced points."""
+    and numbers of events: all, without a term, replaced points. With feet, they touch in place of the box."""
     slides = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
-    box = f'<body pos="0 0 .1">{slides}{hinge}<geom type="box" size=".2 .1 .1" mass="1" friction=".6"/></body>'
+    touches = 'contype="0" conaffinity="0"' if feet else ""
+    body = f'<geom type="box" size=".2 .1 .1" mass="1" friction=".6" {touches}/>'
+    box = f'<body pos="0 0 .1">{slides}{hinge}{body}{feet}</body>'
     scene = scene_of(floor_scene(box, '<option timestep="0.004"/>'))
     position, sigma, steps = np.array([0.15]), 0.05, 100
 
@@ -179,6 +181,8 @@ def slope_and_mean(hinge: str, onset: str) -> tuple[float, float, np.ndarray]:
 
 
 TILTED = '<joint type="hinge" axis="0 1 0"/>'
+FOOT = '<geom type="sphere" size=".001" mass=".001" pos="{} {} -.099" friction=".6"/>'
+FEET = "".join(FOOT.format(x, y) for x in (-0.199, 0.199) for y in (-0.099, 0.099))
 
 
 @pytest.mark.parametrize("onset", ["linear", pytest.param("jump", marks=pytest.mark.slow)])
@@ -191,9 +195,58 @@ def test_a_box_that_lands_flat_has_the_slope(onset: str) -> None:
 
 def test_a_box_that_lands_tilted_is_off_and_counted() -> None:
     """Its corners replace each other in penetration, for which there is no term."""
-    slope, mean, (_, _, replaced) = slope_and_mean(TILTED, "linear")
+    slope, mean, (found, missed, replaced) = slope_and_mean(TILTED, "linear")
     assert 0.2 < 1 - mean / slope < 0.4
-    assert replaced > 2 * 400
+    assert replaced > 2 * 400 and missed < 0.5 * found
+
+
+@pytest.mark.parametrize("onset", ["linear", pytest.param("jump", marks=pytest.mark.slow)])
+def test_with_feet_in_place_of_corners_it_has_the_slope(onset: str) -> None:
+    slope, mean, (found, _, replaced) = slope_and_mean(TILTED, onset, FEET)
+    assert abs(mean / slope - 1) < 0.03
+    assert found > 3 * 400 and replaced == 0
+
+
+@pytest.mark.parametrize(
+    ("steps", "guards_at", "used", "chatter"),
+    [
+        pytest.param([1, 5, 9, 60], [0, 0, 0, 0], 4, [1, 1, 1, 0], id="three in a row"),
+        pytest.param([1, 5, 60, 64], [0, 0, 0, 0], 4, [0, 0, 0, 0], id="begins and ends soon, twice"),
+        pytest.param([1, 5, 9, 13], [0, 1, 0, 1], 4, [0, 0, 0, 0], id="two contacts"),
+        pytest.param([1, 13, 25, 37], [0, 0, 0, 0], 4, [0, 0, 0, 0], id="slowly"),
+        pytest.param([1, 5, 9, 13], [0, 0, 0, 0], 2, [0, 0, 0, 0], id="without slots"),
+    ],
+)
+def test_rows_of_events_of_one_contact_are_told(
+    monkeypatch: pytest.MonkeyPatch, steps: list[int], guards_at: list[int], used: int, chatter: list[int]
+) -> None:
+    """Steps of 2 ms, and contact that relaxes in 10 ms: up to ten steps apart is soon. Three make a row here."""
+    monkeypatch.setattr(touch, "LEAST", 3)
+    number, none = len(steps), jnp.zeros((len(steps), 2), bool)
+    ends = jnp.arange(number) % 2 == 1
+    at = jnp.array(steps, jnp.int32), jnp.array(guards_at)
+    events = Events(*at, ends, ends, none, none, jnp.arange(number) < used)
+    np.testing.assert_array_equal(events.chattering(jnp.full(number, 100.0), 2e-3), np.array(chatter, bool))
+
+
+def test_a_box_that_chatters_has_no_terms_that_multiply_each_other() -> None:
+    """Sliding on four corners, which touch and leave at nearly no speed; with all terms the deviation is 17."""
+    body = '<body pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .1" mass="1" friction=".5"/></body>'
+    scene = scene_of(floor_scene(body, '<option timestep="0.005"/>', 'friction=".5"'))
+    start = initial_state(scene)
+
+    def last(speed, corrects):
+        state = dataclasses.replace(start, qvel=start.qvel.at[0].set(speed))
+        if not corrects:
+            return rollout(scene, scene.model, state, LAW, 100)[0].qpos[-1, 0], jnp.zeros(())
+        states, *_, counts = corrected_rollout(scene, scene.model, state, LAW, 100, slots=96)
+        return states.qpos[-1, 0], counts.missed
+
+    both = lambda speed: tuple(jax.grad(last, has_aux=True)(speed, each) for each in (False, True))  # noqa: E731
+    speeds = 1.0 + 0.1 * np.random.default_rng(0).standard_normal(200)
+    (plain, _), (corrected, missed) = compiled(jax.vmap(both), speeds)
+    assert 0 < np.std(plain) < np.std(corrected) < 40 * np.std(plain) < 1
+    assert np.mean(missed) > 10
 
 
 @pytest.mark.parametrize(

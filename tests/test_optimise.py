@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 import xarray as xr
@@ -17,7 +16,6 @@ from PIL import Image
 import estimators
 from estimators import ESTIMATORS, Differentiation, FirstOrder
 from mjx_study import cli
-from mjx_study.cli import motions
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import descents, plan, sampling
 from mjx_study.experiment import iteration as descent
@@ -249,22 +247,16 @@ def test_outcomes_of_the_sliding_box_tell_who_is_aboard() -> None:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A folder that the command wrote, and what it printed."""
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that the command wrote."""
     folder = tmp_path_factory.mktemp("optimise") / "out"
     arguments = ["optimise", "pusher", "--reference", "--horizon", "8", "--iterations", "4", "--seeds", "2"]
-    patch = pytest.MonkeyPatch()
-    lines: list[str] = []
-    patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
-    try:
-        assert cli.main([*arguments, "--samples", "4", "--evaluation-samples", "5", "--output", str(folder)]) == 0
-    finally:
-        patch.undo()
-    return folder, "\n".join(lines)
+    assert cli.main([*arguments, "--samples", "4", "--evaluation-samples", "5", "--output", str(folder)]) == 0
+    return folder
 
 
-def test_the_command_writes_a_study_a_figure_and_policies(written: tuple[Path, str]) -> None:
-    folder, printed = written
+def test_the_command_writes_a_study_a_figure_and_policies(written: Path) -> None:
+    folder = written
     names = ("zobg", "fobg", "aobg")
     expected = {"study.json", "study.lock", "cells", "results.nc", "descent.png", "descent.pdf"}
     expected |= {f"policy-{name}.json" for name in names}
@@ -274,12 +266,10 @@ def test_the_command_writes_a_study_a_figure_and_policies(written: tuple[Path, s
     assert not [name for name in data if str(name).startswith(METRIC)]
     with Image.open(folder / "descent.png") as picture:
         assert picture.width > 1000
-    for words in ("analytic reference; sgd, learning rate 0.001", "2 seeds from 0", "ZoBG", "rollouts", "seconds"):
-        assert words in printed
 
 
-def test_a_policy_is_replayed(written: tuple[Path, str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    policy = written[0] / "policy-fobg.json"
+def test_a_policy_is_replayed(written: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    policy = written / "policy-fobg.json"
     theta = json.loads(policy.read_text())["theta"]
     arguments = ["rollout", "pusher", "--theta", str(policy), "--frames", "1", "--json"]
     assert cli.main([*arguments, "--output", str(tmp_path / "replay")]) == 0
@@ -289,9 +279,8 @@ def test_a_policy_is_replayed(written: tuple[Path, str], capsys: pytest.CaptureF
     assert {"task", "theta", "digest", *POLICY_OPTIONS} <= kept.keys()
     del kept["digest"]  # as somebody does who changes the file
     (changed := tmp_path / "changed.json").write_text(json.dumps(kept | {"timestep": 0.0025, "solver": "cg"}))
-    simulate, _ = motions._plan_task(cli.parser().parse_args(["rollout", "pusher", "--theta", str(changed)]))
-    option = simulate.args[0].scene.host.opt
-    assert (option.timestep, option.solver) == (0.0025, mujoco.mjtSolver.mjSOL_CG)
+    assert cli.main([*arguments[:3], str(changed), *arguments[4:], "--output", str(tmp_path / "changed")]) == 0
+    assert json.loads(capsys.readouterr().out)["duration"] == pytest.approx(8 * 0.0025)
 
 
 @pytest.mark.slow

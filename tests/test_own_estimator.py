@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
-from mjx_study import cli, experiment
+from mjx_study import cli
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.plots.style import combines, style_of
 from mjx_study.results.rows import rows_of
@@ -158,12 +158,6 @@ def test_reading_imports_nothing(studies: dict[str, Path], folder: Path) -> None
     assert not (folder / "trapped").exists() and "my_estimators" not in sys.modules
     page = (folder / "out" / "report.html").read_text()
     assert "<td>Cautious</td>" in page and "<td>Registered</td>" in page
-
-
-def test_these_are_all_figures() -> None:
-    named = re.compile(r'"(\w+)"\]?(?::| =) Drawing\(')
-    drawn = {name for path in Path(experiment.__path__[0]).glob("*.py") for name in named.findall(path.read_text())}
-    assert {each for figures in FIGURES.values() for each in figures} - {"map_stiffness_samples"} == drawn != set()
 
 
 def test_landscape_takes_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

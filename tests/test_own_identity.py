@@ -29,7 +29,7 @@ from mjx_study.storage.folder import Store
 from tests.documents import planned_arrays, stub_cells
 
 TASK = """
-import importlib, os
+import data, importlib, os
 from collections import deque
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -51,101 +51,83 @@ weights = Weights()
 CALLED = """
 class Cost:
     def __init__(self): self.by = 1.0
-    def __call__(self, state): return self.by * TABLE["a"] * state.qpos[0]
-TABLE = {"a": data.SCALE}
+    def __call__(self, state): return self.by * TABLE[0] * state.qpos[0]
 """
 HELD = """
 def cost_with(held):
     def cost(state): return state.qpos[0] * jnp.arange(9.0)[held].sum()
     return cost
 """
+TABLE, IN_TABLE, IN_TASK = "TABLE = [data.SCALE]\n", "global TABLE of", "task hopping:hop differs"
 CASES: dict[str, tuple[str, str, str]] = {
-    "a global dict": ('import data\nTABLE = {"a": data.SCALE}', PLAIN.format('TABLE["a"]'), "global TABLE of"),
-    "a dict in a dict": (
-        'import data\nTABLE = {"a": {"b": [data.SCALE]}}', PLAIN.format('TABLE["a"]["b"][0]'), "global TABLE of",
-    ),
-    "a global list": ("import data\nLIST = [1.0, data.SCALE]", PLAIN.format("LIST[1]"), "global LIST of"),
-    "a global set": ("import data\nSET = {1.0, data.SCALE}", PLAIN.format("max(SET)"), "global SET of"),
-    "a deque": ("import data\nLAST = deque([data.SCALE])", PLAIN.format("LAST[0]"), "global LAST of"),
+    "a global dict": ('TABLE = {"a": data.SCALE}', PLAIN.format('TABLE["a"]'), IN_TABLE),
+    "a dict in a dict": ('TABLE = {"a": {"b": [data.SCALE]}}', PLAIN.format('TABLE["a"]["b"][0]'), IN_TABLE),
+    "a global list": ("LIST = [1.0, data.SCALE]", PLAIN.format("LIST[1]"), "global LIST of"),
+    "a global set": ("SET = {1.0, data.SCALE}", PLAIN.format("max(SET)"), "global SET of"),
+    "a deque": ("LAST = deque([data.SCALE])", PLAIN.format("LAST[0]"), "global LAST of"),
     "a subclass of dict": (
-        "import data\nclass Own(dict): pass\nOWN = Own()\nOWN.by = data.SCALE", PLAIN.format("OWN.by"), "global OWN of",
+        "class Own(dict): pass\nOWN = Own()\nOWN.by = data.SCALE", PLAIN.format("OWN.by"), "global OWN of",
     ),
-    "a global object": (
-        "import data\nclass It: pass\nit = It()\nit.by = data.SCALE", PLAIN.format("it.by"), "global it of",
-    ),
-    "slots": (f"import data\n{SLOTTED}", PLAIN.format("weights.one"), "global weights of"),
-    "__call__ of a class": (f"import data\n{CALLED}", "Cost()", "global TABLE of"),
+    "a global object": ("class It: pass\nit = It()\nit.by = data.SCALE", PLAIN.format("it.by"), "global it of"),
+    "slots": (SLOTTED, PLAIN.format("weights.one"), "global weights of"),
+    "__call__ of a class": (TABLE + CALLED, "Cost()", IN_TABLE),
     "a method": (
-        "import data\nTABLE = [data.SCALE]\nclass It:\n    def cost(self, state): return TABLE[0] * state.qpos[0]",
-        "It().cost", "global TABLE of",
+        TABLE + "class It:\n    def cost(self, state): return TABLE[0] * state.qpos[0]", "It().cost", IN_TABLE,
     ),
     "an attribute of a class": (
-        "import data\nclass It:\n    by = data.SCALE\n    def cost(self, state): return self.by * state.qpos[0]",
-        "It().cost", "task hopping:hop differs",
+        "class It:\n    by = data.SCALE\n    def cost(self, state): return self.by * state.qpos[0]", "It().cost",
+        IN_TASK,
     ),
     "a static method": (
-        "import data\nTABLE = [data.SCALE]\nclass It:\n    @staticmethod\n    def by(): return TABLE[0]",
-        PLAIN.format("It.by()"), "global TABLE of",
+        TABLE + "class It:\n    @staticmethod\n    def by(): return TABLE[0]", PLAIN.format("It.by()"), IN_TABLE,
     ),
     "a class method": (
-        "import data\nTABLE = [data.SCALE]\nclass It:\n    @classmethod\n    def by(cls): return TABLE[0]",
-        PLAIN.format("It.by()"), "global TABLE of",
+        TABLE + "class It:\n    @classmethod\n    def by(cls): return TABLE[0]", PLAIN.format("It.by()"), IN_TABLE,
     ),
     "a base class": (
-        "import data\nTABLE = [data.SCALE]\nclass Base:\n    def by(self): return TABLE[0]\nclass It(Base): pass",
-        PLAIN.format("It().by()"), "global TABLE of",
+        TABLE + "class Base:\n    def by(self): return TABLE[0]\nclass It(Base): pass", PLAIN.format("It().by()"),
+        IN_TABLE,
     ),
     "a property": (
-        "import data\nTABLE = [data.SCALE]\nclass It:\n    @property\n    def by(self): return TABLE[0]\nit = It()",
-        PLAIN.format("it.by"), "global TABLE of",
+        TABLE + "class It:\n    @property\n    def by(self): return TABLE[0]\nit = It()", PLAIN.format("it.by"),
+        IN_TABLE,
     ),
     "a helper under jit": (
-        "import data\nTABLE = [data.SCALE]\nhelp = jax.jit(lambda x: TABLE[0] * x)",
-        "lambda state: help(state.qpos[0])", "global TABLE of",
+        TABLE + "help = jax.jit(lambda x: TABLE[0] * x)", "lambda state: help(state.qpos[0])", IN_TABLE,
     ),
     "a helper under vmap": (
-        "import data\nhelp = jax.vmap(lambda x, y: x + y[0], in_axes=(0, data.AXIS))",
-        "lambda state: help(state.qpos, jnp.eye(2))[0] * 1.0", "task hopping:hop differs",
+        "help = jax.vmap(lambda x, y: x + y[0], in_axes=(0, data.AXIS))",
+        "lambda state: help(state.qpos, jnp.eye(2))[0] * 1.0", IN_TASK,
     ),
     "a rule of a custom derivative": (
-        "import data\nTABLE = [data.SCALE]\nhelp = jax.custom_jvp(lambda x: x)\n"
+        TABLE + "help = jax.custom_jvp(lambda x: x)\n"
         "@help.defjvp\ndef _(primals, tangents): return primals[0], TABLE[0] * tangents[0]",
-        "lambda state: help(state.qpos[0])", "global TABLE of",
+        "lambda state: help(state.qpos[0])", IN_TABLE,
     ),
-    "a cached helper": (
-        "import data\nTABLE = [data.SCALE]\n@lru_cache\ndef help(): return TABLE[0]",
-        PLAIN.format("help()"), "global TABLE of",
-    ),
+    "a cached helper": (TABLE + "@lru_cache\ndef help(): return TABLE[0]", PLAIN.format("help()"), IN_TABLE),
     "a partial": (
-        "import data\nclass It: pass\nit = It()\nit.by = data.SCALE\ndef cost(it, state): return it.by * state.qpos[0]",
-        "partial(cost, it)", "task hopping:hop differs",
+        "class It: pass\nit = It()\nit.by = data.SCALE\ndef cost(it, state): return it.by * state.qpos[0]",
+        "partial(cost, it)", IN_TASK,
     ),
-    "a slice in a closure": (f"import data\n{HELD}", "cost_with(slice(0, data.COUNT))", "task hopping:hop differs"),
-    "a range in a closure": (
-        f"import data\n{HELD}", "cost_with(np.array(range(data.COUNT)))", "task hopping:hop differs",
-    ),
+    "a slice in a closure": (HELD, "cost_with(slice(0, data.COUNT))", IN_TASK),
+    "a range in a closure": (HELD, "cost_with(np.array(range(data.COUNT)))", IN_TASK),
     "a range itself": (
-        "import data\ndef cost_with(r): return lambda state: state.qpos[0] * sum(r)",
-        "cost_with(range(data.COUNT))", "task hopping:hop differs",
+        "def cost_with(r): return lambda state: state.qpos[0] * sum(r)", "cost_with(range(data.COUNT))", IN_TASK,
     ),
-    "an attribute of a module": ("import data", PLAIN.format("data.SCALE"), "global SCALE of data"),
+    "an attribute of a module": ("", PLAIN.format("data.SCALE"), "global SCALE of data"),
     "an attribute of a function": (
-        "import data\ndef cost(state): return cost.by * state.qpos[0]\ncost.by = data.SCALE",
-        "cost", "task hopping:hop differs",
+        "def cost(state): return cost.by * state.qpos[0]\ncost.by = data.SCALE", "cost", IN_TASK,
     ),
-    "a default argument": (
-        "import data\ndef cost(state, by=[data.SCALE]): return by[0] * state.qpos[0]", "cost", "task hopping:hop",
-    ),
+    "a default argument": ("def cost(state, by=[data.SCALE]): return by[0] * state.qpos[0]", "cost", IN_TASK),
     "a function made at run time": (
-        "import data\nexec(f'def cost(state): return {data.SCALE} * state.qpos[0]')", "cost", "task hopping:hop",
+        "exec(f'def cost(state): return {data.SCALE} * state.qpos[0]')", "cost", "task hopping:hop",
     ),
     "an object array": (
-        "import data\nARRAY = np.array([{'a': data.SCALE}], dtype=object)",
-        PLAIN.format("ARRAY[0]['a']"), "global ARRAY of",
+        "ARRAY = np.array([{'a': data.SCALE}], dtype=object)", PLAIN.format("ARRAY[0]['a']"), "global ARRAY of",
     ),
     "a random generator": (
-        "import data\nDRAWN = np.random.default_rng(int(data.SCALE))",
-        PLAIN.format("DRAWN.bit_generator.state['uinteger']"), "global DRAWN of",
+        "DRAWN = np.random.default_rng(int(data.SCALE))", PLAIN.format("DRAWN.bit_generator.state['uinteger']"),
+        "global DRAWN of",
     ),
     "a lazy import": (
         "def cost(state):\n    import lazy\n    return lazy.BY * state.qpos[0]", "cost", "source of lazy.py",
@@ -154,8 +136,8 @@ CASES: dict[str, tuple[str, str, str]] = {
         "def cost(state):\n    import between\n    return between.help() * state.qpos[0]", "cost", "source of lazy.py",
     ),
     "an import by name": (
-        "def cost(state): return importlib.import_module('la' + 'zy').BY * state.qpos[0]",
-        "cost", "file lazy.py differs",
+        "def cost(state): return importlib.import_module('la' + 'zy').BY * state.qpos[0]", "cost",
+        "file lazy.py differs",
     ),
     "a variable": ("", PLAIN.format('float(os.environ["HOP_BY"])'), "variable HOP_BY differs"),
     "a variable by getenv": ("", PLAIN.format('float(os.getenv("HOP_BY", "1"))'), "variable HOP_BY differs"),

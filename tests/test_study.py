@@ -28,7 +28,7 @@ from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.panels import limit
 from mjx_study.plots.study import plot_study
 from mjx_study.results.kind import findings_of
-from mjx_study.results.rows import Row, rows_of
+from mjx_study.results.rows import Row, remains, rows_of
 from mjx_study.results.variables import GRADIENTS
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.dataset import dataset_of
@@ -43,12 +43,6 @@ SMALL: dict[str, Any] = {"horizon": 4, "samples": (8,), "reference_samples": 8, 
 def config(**changes: Any) -> StudyConfig:
     chosen: dict[str, Any] = {"tasks": ("pusher",)} | SMALL | changes
     return StudyConfig(**chosen)
-
-
-@pytest.fixture(autouse=True)
-def wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tables that no terminal breaks up."""
-    monkeypatch.setenv("COLUMNS", "200")
 
 
 def compare(**changes: Any) -> xr.Dataset:
@@ -315,14 +309,6 @@ def test_a_label_has_the_onset_term(name: str, onset: str, label: str) -> None:
     assert label_of(name, onset) == label
 
 
-def test_a_table_and_its_findings_say_that_there_is_an_onset_term() -> None:
-    dataset = result(row("zobg", 10, 100.0), row("fobg", 10, 1.0))
-    dataset.attrs["config"] = json.dumps(json.loads(dataset.attrs["config"]) | {"onset": "linear"})
-    printed = table(dataset)
-    assert any(" FoBG (onset) " in line for line in printed) and any(" ZoBG " in line for line in printed)
-    assert findings_of(dataset)[0].startswith("penalty: FoBG (onset)'s variance is below ZoBG's")
-
-
 def test_noises_are_told_apart() -> None:
     """Not the last one's verdict for all."""
     parts = [result(row("zobg", 10, 100), row("fobg", 10, variance)) for variance in (1, 1e6)]
@@ -333,23 +319,6 @@ def test_noises_are_told_apart() -> None:
 
 def as_json(dataset: xr.Dataset) -> dict[str, Any]:
     return as_document(dataset, console.rows_as_json)
-
-
-def table(dataset: xr.Dataset, details: bool = True) -> list[str]:
-    return console.gradient_lines(dataset, as_json(dataset), details)
-
-
-def test_doubtful_numbers_are_marked_in_the_table() -> None:
-    sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
-    lines = table(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)))
-    (above,) = [line for line in lines if "0.325 -> 0.2980 ± 0.0098" in line]
-    assert "30 (10 %)" in above and "?" not in above
-    (below,) = [line for line in lines if "1.2 (90 %)" in line]
-    assert "(0.5 to 2)?" in below
-    assert any(line.startswith("?: fewer than 3 effective samples") for line in lines)
-    assert not any("?" in line for line in table(result(sure)))
-    nothing = row("fobg", 20, 1, effective_samples=1.2, relative_error=0.3, debiased_error=0.0, debiased_error_se=0.5)
-    assert any("0.3 -> ?  " in line for line in table(result(nothing)))
 
 
 def test_warnings_name_what_must_not_be_overlooked() -> None:
@@ -381,50 +350,22 @@ def test_the_unstable_band_begins_at_the_limit() -> None:
     assert critical == pytest.approx(0.05 * (2 * (math.sqrt(2) - 1) / 0.01) ** 2, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("value", "error", "shown"),
-    [
-        (832.0912, 0.0123, "832.091 ± 0.012"),
-        (-1.42, 0.13, "-1.42 ± 0.13"),
-        (0.00012, 0.0101, "0 ± 0.010"),
-        (-0.009331, 2.14e-5, "-0.009331 ± 2.1e-5"),
-        (39123.4, 37456.0, "39000 ± 37000"),
-        (6.8321e20, 1.2e18, "6.832e20 ± 1.2e18"),
-        (0.5, 0.0, "0.5 ± 0"),
-        (0.5, 1e-17, "0.5 ± 0"),
-        (0.12345, None, "0.123"),
-        (0.12345, math.nan, "0.123"),
-        (math.inf, 1.0, "inf"),
-    ],
-)
-def test_a_number_and_its_error_have_the_same_digits(value: float, error: float | None, shown: str) -> None:
-    assert console.with_error(value, error) == shown
+ERRORS = [
+    (0.325, 0.298, 0.0098, "0.2980 ± 0.0098"), (7.825, 1.684, 10.088, "2 ± 10"), (0.25, 0.0, 0.2, "-"),
+    (0.00047, 0.00031, 0.00012, "0.00031 ± 0.00012"), (0.0043, 0.0, 0.0002, "< 4.0e-4"), (0.25, 0.0, 0.01, "< 0.02"),
+    (3.3e4, 240.0, 4.6e4, "0 ± 46000"), (3.0, 832.0912, 0.0123, "832.091 ± 0.012"), (0.1, 0.5, 1e-17, "0.5 ± 0"),
+    (0.1, 6.8321e20, 1.2e18, "6.832e20 ± 1.2e18"), (0.1, 0.12345, math.nan, "0.123"), (0.1, math.inf, 1.0, "inf"),
+]  # fmt: skip
+COSINES = [(0.9, 1.0, 0.013, "> 0.97"), (0.9, 1.0, 0.0004, "> 0.9992"), (0.9, 1.0, 1e-9, "> 0.9999")]
 
 
 @pytest.mark.parametrize(
-    ("value", "debiased", "error", "shown"),
-    [
-        (0.325, 0.298, 0.0098, "0.325 -> 0.2980 ± 0.0098"),
-        (7.825, 1.684, 10.088, "7.83 -> 2 ± 10"),
-        (0.00047, 0.00031, 0.00012, "4.7e-4 -> 0.00031 ± 0.00012"),
-        (0.0043, 0.0, 0.0002, "0.0043 -> < 4.0e-4"),
-        (0.25, 0.0, 0.01, "0.25 -> < 0.02"),
-        (0.25, 0.0, 0.2, "0.25 -> -"),
-        (3.3e4, 240.0, 4.6e4, "3.3e4 -> 0 ± 46000"),
-    ],
+    ("name", "value", "debiased", "error", "shown"),
+    [*(("relative_error", *each) for each in ERRORS), *(("cosine", *each) for each in COSINES)],
 )
-def test_no_error_is_rounded_to_nothing(value: float, debiased: float, error: float, shown: str) -> None:
-    each = row("fobg", 10, 1, relative_error=value, debiased_error=debiased, debiased_error_se=error)
-    assert any(f"  {shown}  " in line for line in table(result(each)))
-
-
-@pytest.mark.parametrize(
-    ("cosine", "error", "shown"),
-    [(0.9, 0.013, "> 0.97"), (0.9, 0.0004, "> 0.9992"), (0.9, 1e-9, "> 0.9999"), (1.0, 0.0, "1 -> 1 ± 0")],
-)
-def test_a_bound_of_a_cosine_is_rounded_down(cosine: float, error: float, shown: str) -> None:
-    each = row("fobg", 10, 1, cosine=cosine, debiased_cosine=1.0, debiased_cosine_se=error)
-    assert any(f"{shown}  " in line for line in table(result(each)))
+def test_what_remains_without_noise(name: str, value: float, debiased: float, error: float, shown: str) -> None:
+    """To the error's second digit; no error is rounded to nothing, and bounds are rounded outwards."""
+    assert remains(name, value, debiased, error) == shown
 
 
 def test_stepwise_estimators_take_a_task_without_controls() -> None:
@@ -433,15 +374,6 @@ def test_stepwise_estimators_take_a_task_without_controls() -> None:
     found = compare(tasks=("ball_wall",), contact=("reference",), **stepwise).gradient
     np.testing.assert_allclose(found.isel(estimator=0), found.isel(estimator=1), rtol=1e-9)  # longer than the rollout
     assert np.isfinite(found).all()
-
-
-@pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 3)])
-def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, tables: int) -> None:
-    monkeypatch.setenv("COLUMNS", str(columns))
-    full = row("aobg", 1000, 6.4e20, alpha=0.5, epsilon=641.0, discrepancy=1.2e11, relative_error=4.1e9)
-    shown = [line for line in table(result(full)) if "K [N/m]" in line or "AoBG" in line]
-    assert sum("K [N/m]" in line for line in shown) == tables
-    assert max(map(len, shown)) <= columns
 
 
 def test_theta_and_sigma_reach_the_plan() -> None:

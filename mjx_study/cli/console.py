@@ -18,6 +18,7 @@ from mjx_study.experiment.iteration import REASONS
 from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS
 from mjx_study.results.curves import curves_of, line_of
 from mjx_study.results.kind import findings_of
+from mjx_study.results.numbers import numbers_of
 from mjx_study.results.rows import Row, onset_of, remains, rows_of
 from mjx_study.results.variables import (
     COLUMNS,
@@ -185,15 +186,8 @@ def curve_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         f"{', '.join(samples)} samples at each, seed {config['seed']}, {document['environment']['precision']}"
         f"{_chosen(config)}",
         "",
-        "where the mean cost is least on the line:",
     ]
-    rows, place, lowest = [], *(DERIVED[each] for each in ("least_at", "least_cost"))
-    for label, one in found:
-        smoothed, error = one["smoothed"].values, one["smoothed_se"].values
-        best = int(np.nanargmin(smoothed)) if np.any(np.isfinite(smoothed)) else 0
-        least = with_error(smoothed[best], error[best], lowest.digits)
-        rows.append([label, place.text(one["position"].values[best]), least])
-    headings = ["contact", f"{place.heading} {name}" + (f" [{unit}]" if unit else ""), lowest.heading]
+    headings, rows = numbers_of(dataset) or ([], [])
     return [*lines, *format_table(rows, headings), "", *document["findings"]]
 
 

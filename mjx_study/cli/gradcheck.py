@@ -7,9 +7,11 @@ from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, 
 from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.options.configuration import OPTIONS, REQUIRED_OPTIONS
-from mjx_study.options.option import Option, OptionError, reject_unused
+from mjx_study.options.configuration import OPTIONS
+from mjx_study.options.estimator_options import REQUIRED_OPTIONS
+from mjx_study.options.option import Option, OptionError
 from mjx_study.options.parser import Parser
+from mjx_study.options.rules import reject_unused
 from mjx_study.table import explain
 
 UNEXERCISED = 3

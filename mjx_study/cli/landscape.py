@@ -4,7 +4,8 @@ import argparse
 
 from mjx_study.choices import REFERENCE
 from mjx_study.cli.options import given_options, study_fields
-from mjx_study.options.configuration import BUILDER_OPTIONS, REQUIRED_OPTIONS, StudyConfig
+from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
+from mjx_study.options.estimator_options import REQUIRED_OPTIONS
 from mjx_study.options.option import OptionError
 from mjx_study.options.parser import MIDDLE, Parser
 from mjx_study.results.variables import LANDSCAPES, explained
@@ -15,8 +16,8 @@ examples:
   mjx-study landscape momentum_transfer --contact penalty,mujoco_default --stiffness 3000,100000
   mjx-study landscape pusher --direction 0 --span=-2,2   the first of 200 forces
 
-columns of the table, the minimum of the mean cost along the line:
-{explained(LANDSCAPES, "least_at", "least_cost")}
+columns of the table:
+{explained(LANDSCAPES, "least_cost", "least_at", "steepest", "nonfinite")}
 
 The figure shows costs above, and slopes below, with 95 % bands. Where the mean cost with noise has a slope that the
 mean of FoBG lacks, the cost jumps: first-order gradients do not see jumps.

@@ -20,8 +20,9 @@ from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.limits import MOST_STEPS, check_count
 from mjx_study.options.configuration import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
-from mjx_study.options.option import OptionError, reject_unused
+from mjx_study.options.option import OptionError
 from mjx_study.options.parser import UsageError
+from mjx_study.options.rules import reject_unused
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.scene import load_model

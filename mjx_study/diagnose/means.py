@@ -25,7 +25,7 @@ from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches
 from mjx_study.experiment.study import StudyPlan, estimators_of
 from mjx_study.experiment.unused_options import CORRECTED, reads_onset
 from mjx_study.objective import Simulator, chunk_for
-from mjx_study.options.configuration import check_span
+from mjx_study.options.rules import check_span
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import local_devices
 from mjx_study.table import Column, as_plain, percent, tabulate

@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, find_estimator, make_estimator
-from mjx_study.options.configuration import ESTIMATOR_OPTIONS, StudyConfig, check_span
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.estimator_options import ESTIMATOR_OPTIONS
 from mjx_study.options.option import OptionError
+from mjx_study.options.rules import check_span
 from mjx_study.tasks.task import Recipe, Task
 
 BOUND: Final = ("gamma", "failure_probability", "variance_proxy", "radius")

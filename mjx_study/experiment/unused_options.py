@@ -6,8 +6,9 @@ from typing import Final
 
 from estimators import ESTIMATORS, ORACLES, Estimator, find_estimator
 from mjx_study.choices import REFERENCE, takes_stiffness
-from mjx_study.options.configuration import ESTIMATOR_OPTIONS, SCENE_OPTIONS, StudyConfig
-from mjx_study.options.option import reject_unused
+from mjx_study.options.configuration import SCENE_OPTIONS, StudyConfig
+from mjx_study.options.estimator_options import ESTIMATOR_OPTIONS
+from mjx_study.options.rules import reject_unused
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 

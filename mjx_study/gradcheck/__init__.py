@@ -5,9 +5,6 @@ another point, and where MJX places a contact elsewhere, the C engine has a diff
 distinguishes these cases for every entry of a step's Jacobian.
 """
 
-from importlib import import_module
-from typing import Any
-
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.check import CONTACT, GradcheckPlan, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.gradcheck.report import Finding, GradcheckReport, StepCheck
@@ -16,10 +13,3 @@ __all__ = [
     "CONTACT", "STIFFNESS", "Finding", "GradcheckPlan", "GradcheckReport", "StepCheck", "gradcheck",
     "plan_gradcheck", "plan_scene_gradcheck",
 ]  # fmt: skip
-
-
-def __getattr__(name: str) -> Any:
-    """Find the checks of means, which had their home here before, in `mjx_study.diagnose`."""
-    if name in ("MeanCheck", "check_mean"):
-        return getattr(import_module("mjx_study.diagnose.means"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

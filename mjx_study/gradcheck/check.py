@@ -12,13 +12,13 @@ from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, laws_of, takes_stif
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
+from mjx_study.gradcheck.engine_step import EngineStep
 from mjx_study.gradcheck.programs import Compiler, ContactCase, Programs
 from mjx_study.gradcheck.report import CostCheck, Finding, GradcheckReport, StepCheck, gravity
 from mjx_study.gradcheck.states import start_of, states_of
 from mjx_study.gradcheck.steps import check_state, collect, step_check
-from mjx_study.gradcheck.values import EngineStep
-from mjx_study.options.configuration import reject_untaken
 from mjx_study.options.option import OptionError
+from mjx_study.options.rules import reject_untaken
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine

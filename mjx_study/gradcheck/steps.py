@@ -12,10 +12,11 @@ from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import ENGINE, NAN, RIGHT, UNRESOLVED, VERDICTS, Codes, judge, worst_error
 from mjx_study.gradcheck.differences import Differences, moves, solution_noise, take_differences
+from mjx_study.gradcheck.engine_step import EngineStep
 from mjx_study.gradcheck.programs import ContactCase, Programs
 from mjx_study.gradcheck.report import Entry, Finding, StepCheck
 from mjx_study.gradcheck.states import Sample
-from mjx_study.gradcheck.values import EngineStep, Values, compare_values
+from mjx_study.gradcheck.values import Values, compare_values
 from mjx_study.simulation.contact import apply_contact, has_mujoco_law
 from mjx_study.table import grouped
 from mjx_study.tasks.contact_grid import ContactPoint

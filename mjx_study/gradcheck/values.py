@@ -1,107 +1,20 @@
 """Compare the steps of this project, `mjx.step` and the C engine; if they differ, report which, where and why."""
 
-import copy
 import dataclasses
-from collections import defaultdict
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
-from mjx_study.gradcheck.coordinates import PAIR_FRICTION, Coordinates, quaternions
-from mjx_study.simulation.contact import ContactModel
-from mjx_study.simulation.contact_pair import geom_label
-from mjx_study.simulation.engine import HostState, converged_host, host_data
+from mjx_study.gradcheck.coordinates import Coordinates, quaternions
+from mjx_study.gradcheck.engine_difference import TOLERANCE, difference_of_engines, largest
+from mjx_study.gradcheck.engine_step import EngineStep, tangent_of
+from mjx_study.simulation.engine import HostState
 
-TOLERANCE: Final = 1e-8
-"""Relative difference above which two implementations differ in a quantity."""
-FAR: Final = 1e100
-MIN_ROW: Final = 1e-12
-"""Size below which a constraint row counts as zero."""
 ROUNDING: Final = 1e-14
 MIN_TURNING: Final = 1e-8
 """Angular velocity [rad/s] below which, in every component, MJX treats the step of an orientation as zero."""
-WARMSTARTS: Final = (0.0, 0.5, 1.001)
-"""Alternative warm starts, relative to the solution, whose results differ only by rounding."""
-PARAMETERS: Final = ("geom_solref", "geom_solimp", "geom_friction", "pair_solref", "pair_solimp", "pair_friction")
-STAGES: Final = {
-    "xpos": "body positions",
-    "ten_length": "tendon lengths",
-    "actuator_length": "actuator lengths",
-    "qM": "the inertia matrix",
-    "qfrc_bias": "the bias force",
-    "qfrc_passive": "passive forces",
-    "act_dot": "the rate of activation",
-    "qfrc_actuator": "actuator forces",
-    "qacc_smooth": "the unconstrained acceleration",
-}
-ROWS: Final = {"efc_J": "Jacobians", "efc_aref": "reference accelerations", "efc_D": "stiffnesses"}
-
-Found = tuple[str, bool]
-"""Description of a difference, and whether it is documented."""
-
-
-class EngineStep:
-    """The C engine's step over the same flat vector of changes, an independent map for differences.
-
-    For one scene, contact model and any integrator, with constraints solved to rounding.
-    """
-
-    def __init__(self, layout: Coordinates, contact: ContactModel | None):
-        self.layout = layout
-        self.host = converged_host(layout.scene, contact)
-        self.host.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self._parameters = {name: getattr(self.host, name).copy() for name in PARAMETERS}
-
-    def after(self, base: HostState) -> HostState:
-        """Return the state after a step; its warm start is the acceleration at the beginning of the step."""
-        data = _forward(self.host, base)
-        qacc = data.qacc.copy()
-        mujoco.mj_step(self.host, data)
-        return HostState(data.qpos.copy(), data.qvel.copy(), data.act.copy(), base.control, qacc)
-
-    def outputs(
-        self, base: HostState, reference: Float[np.ndarray, " nq"], changes: Float[np.ndarray, "batch inputs"]
-    ) -> Float[np.ndarray, "batch outputs"]:
-        """Return (position relative to `reference`, velocity, activation) after a step from each changed state."""
-        layout, data, rows = self.layout, host_data(self.host, base), []
-        for change in changes:
-            self._set_state(data, base, change[: layout.num_state])
-            self._set_parameters(change[layout.num_state :] * layout.scales)
-            mujoco.mj_step(self.host, data)
-            rows.append(np.concatenate([_tangent(self.host, reference, data.qpos), data.qvel, data.act]))
-        self._set_parameters(np.zeros(len(layout.scales)))
-        return np.array(rows)
-
-    def noise(self, base: HostState, reference: Float[np.ndarray, " nq"]) -> Float[np.ndarray, " outputs"]:
-        """Change of the outputs with the solver's warm start, which should not affect them."""
-        still = np.zeros((1, len(self.layout.inputs)))
-        exact = self.outputs(base, reference, still)
-        starts = [dataclasses.replace(base, warmstart=factor * base.warmstart) for factor in WARMSTARTS]
-        return np.max([np.abs(self.outputs(start, reference, still) - exact)[0] for start in starts], axis=0)
-
-    def _set_state(self, data: mujoco.MjData, base: HostState, change: Float[np.ndarray, " changes"]) -> None:
-        host, lengths = self.host, quaternions(self.host)
-        ends = np.cumsum([host.nv, len(lengths), host.nv, host.na]).tolist()
-        tangent, stretch, qvel, act, control = np.split(change, ends)
-        data.time = 0.0
-        data.qpos[:] = base.qpos
-        mujoco.mj_integratePos(host, data.qpos, tangent, 1.0)
-        for (_, first, _), factor in zip(lengths, stretch, strict=True):
-            data.qpos[first : first + 4] *= 1 + factor
-        data.qvel[:], data.act[:], data.ctrl[:] = base.qvel + qvel, base.act + act, base.control + control
-        data.qacc_warmstart[:] = base.warmstart
-
-    def _set_parameters(self, change: Float[np.ndarray, " parameters"]) -> None:
-        if not len(change):
-            return
-        solref, solimp, friction = np.split(change, [2, 7])
-        shifts = (solref, solimp, friction, solref, solimp, friction[PAIR_FRICTION])
-        for (name, value), shift in zip(self._parameters.items(), shifts, strict=True):
-            getattr(self.host, name)[:] = value + shift
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,16 +81,8 @@ def compare_values(
 
 def _change(host: mujoco.MjModel, before: HostState, after: HostState) -> Float[np.ndarray, " outputs"]:
     """Change of position in the tangent space, velocity and activation."""
-    tangent = _tangent(host, before.qpos, after.qpos)
+    tangent = tangent_of(host, before.qpos, after.qpos)
     return np.concatenate([tangent, after.qvel - before.qvel, after.act - before.act])
-
-
-def _tangent(
-    host: mujoco.MjModel, before: Float[np.ndarray, " nq"], after: Float[np.ndarray, " nq"]
-) -> Float[np.ndarray, " nv"]:
-    tangent = np.empty(host.nv)
-    mujoco.mj_differentiatePos(host, tangent, 1.0, before, after)
-    return tangent
 
 
 def _apart(
@@ -190,173 +95,16 @@ def _apart(
     """Difference of two next states beyond rounding, relative to the largest velocity, acceleration, activation."""
     host, timestep = layout.scene.host, layout.scene.timestep
     speed, force, activation = (
-        max(_largest(getattr(ours, name)), _largest(getattr(theirs, name))) for name in ("qvel", "warmstart", "act")
+        max(largest(getattr(ours, name)), largest(getattr(theirs, name))) for name in ("qvel", "warmstart", "act")
     )
     speed = max(speed, timestep * force)
     still = np.zeros(host.nv)  # angular velocities that MJX treats as zero
     for _, _, first in quaternions(host):
         turning = np.abs(ours.qvel[first : first + 3])
         still[first : first + 3] = np.where(turning.max() <= MIN_TURNING, turning, 0.0)
-    unseen = (ROUNDING * max(1.0, _largest(before.qpos)) + timestep * still, ROUNDING * speed, ROUNDING)
+    unseen = (ROUNDING * max(1.0, largest(before.qpos)) + timestep * still, ROUNDING * speed, ROUNDING)
     scales = (timestep * speed, timestep * force, activation)
     parts = np.split(_change(host, theirs, ours), [host.nv, 2 * host.nv])
     gaps = [np.abs(part) - rounding for part, rounding in zip(parts, unseen, strict=True)]
     sizes = [np.full(len(part), max(scale, 1e-10 * timestep)) for part, scale in zip(parts, scales, strict=True)]
     return np.maximum(np.concatenate(gaps) - noise, 0.0) / np.concatenate(sizes)
-
-
-def difference_of_engines(
-    host: mujoco.MjModel,
-    state: HostState,
-    stages: dict[str, Any],
-    ours: Float[np.ndarray, " nv"],
-    theirs: Float[np.ndarray, " nv"],
-) -> tuple[str, bool]:
-    """Describe the differences between the steps of the C engine and MJX, and whether all are documented.
-
-    Args:
-        stages: MJX's intermediate quantities at the state.
-        ours, theirs: constrained acceleration of MJX and of the engine [m/s^2 or rad/s^2].
-    """
-    found, data = [], _forward(host, state)
-    if text := _stage(host, data, stages):
-        host = copy.copy(host)
-        for kind in ("body", "geom", "site"):
-            getattr(host, f"{kind}_sameframe")[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
-        data = _forward(host, state)
-        remains = _stage(host, data, stages)
-        same_frame = f"{text} (C takes frames less than 1e-6 apart for the same, MJX does not)"
-        found = [(remains, False) if remains else (same_frame, True)]
-    contacts = _contacts(host, data, stages)
-    if not found and not contacts and _relative(ours, theirs) <= TOLERANCE:
-        found = [_integration(host)]
-    elif all(documented for _, documented in found):
-        found += contacts + _rows(host, data, stages, contacts=not contacts)
-    found = found or [("the solution of the constraints", False)]
-    return "; ".join(text for text, _ in found), all(documented for _, documented in found)
-
-
-def _largest(values: np.ndarray) -> float:
-    return float(np.abs(values).max(initial=0.0))
-
-
-def _relative(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Largest difference, relative to the largest magnitude."""
-    return _largest(ours - theirs) / max(_largest(theirs), _largest(ours), 1e-10)
-
-
-def _forward(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
-    data = host_data(host, state)
-    mujoco.mj_forward(host, data)
-    return data
-
-
-def _stage(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> str | None:
-    """Return the first quantity that differs, which explains later ones; None if none differs."""
-    inertia = np.zeros((host.nv, host.nv))
-    mujoco.mj_fullM(host, data, inertia)
-    for name, words in STAGES.items():
-        theirs = inertia if name == "qM" else np.asarray(getattr(data, name))
-        gap = _relative(np.asarray(stages[name]).reshape(theirs.shape), theirs)
-        if not gap <= TOLERANCE:
-            return f"{words} differ{'' if words.endswith('s') else 's'} by {gap:.1e}"
-    return None
-
-
-def _integration(host: mujoco.MjModel) -> Found:
-    text = "the integration: the state after the step differs, its acceleration does not"
-    fast = host.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    if fast and np.any(host.actuator_forcelimited | host.actuator_ctrllimited):
-        return f"{text} (MJX's implicitfast damps as if no force or control were clamped)", True
-    return text, False
-
-
-def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> list[Found]:
-    """Pairs of geoms whose contacts differ in number or position."""
-    ours: dict[tuple[int, ...], list[np.ndarray]] = defaultdict(list)
-    theirs: dict[tuple[int, ...], list[np.ndarray]] = defaultdict(list)
-    for index in np.flatnonzero(stages["dist"] < stages["margin"]):
-        geometry = np.concatenate([stages["dist"][[index]], stages["pos"][index], stages["frame"][index].ravel()])
-        ours[tuple(sorted(stages["geom"][index].tolist()))].append(geometry)
-    for contact in data.contact:
-        if contact.exclude == 0:
-            geometry = np.concatenate([[contact.dist], contact.pos, contact.frame])
-            theirs[tuple(sorted(contact.geom.tolist()))].append(geometry)
-    texts = []
-    for pair in sorted(ours.keys() | theirs.keys()):
-        mine, its = np.array(ours[pair]), np.array(theirs[pair])
-        label = " and ".join(geom_label(host, geom) for geom in pair)
-        if len(mine) != len(its):
-            texts.append(f"{label} touch at {len(mine)} points in MJX, {len(its)} in C")
-            continue
-        order, match = _matched(cdist(mine[:, 1:4], its[:, 1:4]))
-        gaps = np.abs(mine[order] - its[match]).max(axis=0)
-        if not gaps.max() <= TOLERANCE:
-            texts.append(
-                f"contacts of {label} lie {gaps[1:4].max():.1e} m apart, their depths differ by {gaps[0]:.1e} m, their "
-                f"normals by {gaps[4:7].max():.1e} and their tangents by {gaps[7:].max():.1e}"
-            )
-    return [(text, True) for text in texts]
-
-
-def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, contacts: bool) -> list[Found]:
-    """Kinds of constraint rows that differ, contact rows included on request.
-
-    MJX sorts rows by kind and contacts by dimension, the C engine by objects and pairs of bodies; rows are therefore
-    matched by their Jacobians, and those with equal Jacobians by the rest. Zero rows are ignored in both.
-    """
-    here = {name: stages[name] for name in ROWS}
-    there = {"efc_J": _jacobian(host, data), "efc_aref": data.efc_aref, "efc_D": data.efc_D}
-    live, alive = (np.abs(rows["efc_J"]).max(axis=1, initial=0.0) > MIN_ROW for rows in (here, there))
-    kinds, labels = stages["efc_type"], _labels(host, data)
-    found: list[Found] = []
-    for kind in np.union1d(kinds[live], data.efc_type[alive]):
-        if "contact" in _kind(kind) and not contacts:
-            continue
-        ours, theirs = np.flatnonzero(live & (kinds == kind)), np.flatnonzero(alive & (data.efc_type == kind))
-        if len(ours) != len(theirs):
-            found.append((f"there are {len(ours)} active {_kind(kind)} rows in MJX, {len(theirs)} in C", False))
-            continue
-        far, *rest = (_distances(here[name][ours], there[name][theirs]) for name in ROWS)
-        order, match = _matched(far + 1e-3 * sum(rest))
-        ours, theirs = ours[order], theirs[match]
-        for label in dict.fromkeys(labels[theirs]):
-            chosen = labels[theirs] == label
-            for name, words in ROWS.items():
-                gap = _relative(here[name][ours[chosen]], there[name][theirs[chosen]])
-                known = name == "efc_aref" and label in ("connect equality", "weld equality")
-                why = " (MJX leaves out -dJ/dt qvel, which the turning of the Jacobian adds)" if known else ""
-                if not gap <= TOLERANCE:
-                    found.append((f"{words} of {label} rows differ by {gap:.1e}{why}", known))
-    return found
-
-
-def _matched(distances: Float[np.ndarray, "ours theirs"]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of pairs with the least total distance; nonfinite ones are matched last."""
-    return linear_sum_assignment(np.nan_to_num(distances, nan=FAR, posinf=FAR))
-
-
-def _distances(ours: np.ndarray, theirs: np.ndarray) -> Float[np.ndarray, "ours theirs"]:
-    """Pairwise distances, relative to the largest magnitude."""
-    mine, its = (rows.reshape(len(rows), -1) for rows in (ours, theirs))
-    return cdist(mine, its, "chebyshev") / max(_largest(mine), _largest(its), MIN_ROW)
-
-
-def _jacobian(host: mujoco.MjModel, data: mujoco.MjData) -> Float[np.ndarray, "rows nv"]:
-    dense = np.zeros((data.nefc, host.nv))
-    if not mujoco.mj_isSparse(host):
-        return data.efc_J.reshape(dense.shape)
-    mujoco.mju_sparse2dense(dense, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
-    return dense
-
-
-def _kind(kind: int | np.integer) -> str:
-    return mujoco.mjtConstraint(int(kind)).name.removeprefix("mjCNSTR_").lower()
-
-
-def _labels(host: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Kind of each of the engine's rows, with the type of equalities."""
-    labels = np.array([_kind(kind) for kind in data.efc_type], dtype=object)
-    for row in np.flatnonzero(labels == "equality"):
-        labels[row] = f"{mujoco.mjtEq(int(host.eq_type[data.efc_id[row]])).name.removeprefix('mjEQ_').lower()} equality"
-    return labels

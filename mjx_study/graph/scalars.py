@@ -22,8 +22,8 @@ from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
-MOST_NATIVE: Final = {"cpu": 100_000, "gpu": 50_000}
-"""Maximum number of scalar operations in native code, by backend; it takes compilers about half a minute."""
+MOST_NATIVE: Final = {"cpu": 100_000, "gpu": 100_000}
+"""Maximum number of scalar operations in native code, by backend; it takes compilers half a minute to two minutes."""
 
 _CAPTURED: Final[dict[Any, ScalarFunction | None]] = {}
 """Graphs, keyed by everything they depend on; None if too large."""

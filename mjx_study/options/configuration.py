@@ -6,17 +6,17 @@ than a pydantic model, since the parser needs them and pydantic alone would add 
 
 import dataclasses
 import itertools
-import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Union, runtime_checkable
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final, Protocol, Union, runtime_checkable
 
 from estimators.choices import DENSITIES, suggestion
-from estimators.registry import ESTIMATORS, options_of_estimators
-from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS, laws_of, takes_stiffness
+from estimators.registry import ESTIMATORS
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS
+from mjx_study.options.estimator_options import of_estimators, with_options_of_estimators
 from mjx_study.options.numbers import MAX_VALUES
 from mjx_study.options.option import OptionError, Rows, declared, options_of
+from mjx_study.options.rules import check_span, reject_untaken
 
 if TYPE_CHECKING:
     import estimators.estimator
@@ -49,32 +49,6 @@ SCENE_OPTIONS: Final = {
 arguments of `load_scene` that they set."""
 BUILDER_OPTIONS: Final = ("horizon", "model", *SCENE_OPTIONS)
 """Options passed to the builder of a task."""
-
-
-ConfigT = TypeVar("ConfigT")
-ESTIMATOR_OPTIONS: Final = {name: field for name, field in options_of_estimators().items() if name != "sigma"}
-"""Options that estimators declare, by name; `sigma` is that of the noise."""
-REQUIRED_OPTIONS: Final = tuple(name for name, field in ESTIMATOR_OPTIONS.items() if field.default is MISSING)
-"""Those without which an estimator that has them cannot be made."""
-
-
-def of_estimators(name: str, **changes: Any) -> Any:
-    """Declare an option as the estimators that have it do, with changes."""
-    field = ESTIMATOR_OPTIONS[name]
-    about = {"default": None if field.default is MISSING else field.default, **field.metadata} | changes
-    about.pop("example")
-    return declared(**about)
-
-
-def with_options_of_estimators(configuration: type[ConfigT]) -> type[ConfigT]:
-    """Add the options that estimators declare and a configuration does not; None for an estimator's default."""
-    for name, field in ESTIMATOR_OPTIONS.items():
-        if name not in configuration.__annotations__:
-            kind: Any = field.type
-            configuration.__annotations__[name] = kind | None
-            usual = "" if field.default is MISSING else str(field.default)
-            setattr(configuration, name, of_estimators(name, default=None, unset=usual))
-    return configuration
 
 
 @runtime_checkable
@@ -336,20 +310,3 @@ StudyConfig.__doc__ = "\n".join(
 def as_arguments(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options that are not None, as arguments of `make_task` and `load_scene`."""
     return {SCENE_OPTIONS.get(name, name): value for name, value in options.items() if value is not None}
-
-
-def check_span(span: Sequence[float] | None) -> None:
-    """Raise OptionError unless span is None or two numbers in ascending order."""
-    if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
-        raise OptionError("span", "must be two numbers, the lower one first; got " + ", ".join(map(str, span)))
-
-
-def reject_untaken(families: Sequence[str], *, stiffness: object, damping: object, smoothing: object = None) -> None:
-    """Raise OptionError for a stiffness, damping or smoothing, not None, that none of the contact families takes."""
-    if smoothing is not None and not laws_of(families):
-        raise OptionError("smoothing", "has no effect on MuJoCo's law: omit it, or add a family such as hunt_crossley")
-    undamped = [family for family in families if family != REFERENCE]
-    for name, value, able in (("stiffness", stiffness, families), ("damping", damping, undamped)):
-        if value is not None and not takes_stiffness(able):
-            chosen = f"contact {', '.join(families)}" if families else "solref or solimp alone"
-            raise OptionError(name, f"has no effect on {chosen}: omit it, or add a family that takes one, e.g. mujoco")

@@ -194,16 +194,3 @@ def _parts(annotation: Any) -> Generator[Any]:
     yield get_origin(annotation) or annotation
     for each in get_args(annotation):
         yield from _parts(each)
-
-
-def reject_unused(given: Collection[str], *uses: tuple[Iterable[str], bool, str]) -> None:
-    """Raise OptionError for the first option that was given and has no effect.
-
-    Args:
-        given: names of the options that were given.
-        uses: options, whether they have an effect here, and the reason if they do not.
-    """
-    for names, used, reason in uses:
-        for name in names:
-            if name in given and not used:
-                raise OptionError(name, reason)

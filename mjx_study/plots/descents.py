@@ -9,11 +9,12 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mjx_study.plots.panels import a_few, against_stiffness, counted, estimators, line, make_panels, model_title
+from mjx_study.plots.panels import a_few, against_stiffness, estimators, line, make_panels, model_title
 from mjx_study.plots.style import line_with_band, robust_limits, style_of
 from mjx_study.results.curves import line_of
 from mjx_study.results.rows import onset_of
 from mjx_study.results.variables import DERIVED, DESCENTS, LANDSCAPES
+from mjx_study.table import plural
 
 MOST_COST_RATIO: Final = 1e7
 """Maximum ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""
@@ -43,7 +44,7 @@ def achieved(part: xr.Dataset, title: str) -> Figure | None:
             axes.plot(x, above, color=style["color"], marker=".", markersize=4, linestyle="none", alpha=0.6)
         axes.set_ylim(floor, ceiling)
 
-    iterations, seeds = part.sizes["iteration"], counted(part.sizes["seed"], "seed")
+    iterations, seeds = part.sizes["iteration"], plural(part.sizes["seed"], "seed")
     seeds += " as dots, and the median" if part.sizes["seed"] > 1 else ""
     return against_stiffness(
         part,
@@ -56,7 +57,7 @@ def achieved(part: xr.Dataset, title: str) -> Figure | None:
 def descent(part: xr.Dataset, title: str) -> Figure:
     """Plot cost against iterations, rollouts and seconds, and alpha; one row for each of a few contact models."""
     models, columns = a_few(part), 4 if bool(part["alpha"].notnull().any()) else 3
-    seeds = counted(part.sizes["seed"], "seed")
+    seeds = plural(part.sizes["seed"], "seed")
     title = f"{title} ({f'median and range of {seeds}' if part.sizes['seed'] > 1 else seeds})"
     figure, grid = make_panels(len(models), columns, 0.6 + 3.4 * columns, 1.3 + 2.5 * len(models), title)
     for row, model in zip(grid, models, strict=True):

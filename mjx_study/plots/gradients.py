@@ -14,7 +14,6 @@ from mjx_study.plots.panels import (
     MOST_PANELS,
     against_stiffness,
     beside,
-    counted,
     estimators,
     families,
     geometric,
@@ -28,6 +27,7 @@ from mjx_study.plots.panels import (
 )
 from mjx_study.plots.style import line_with_band
 from mjx_study.results.variables import COORDINATES, GRADIENTS
+from mjx_study.table import plural
 
 WHOLE: Final = "as large as the gradient"
 
@@ -65,7 +65,7 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
             shade_unstable(panel, family, rows, x)
         _mark_default(above, family, rows)
     axes[0, 0].set_ylabel(GRADIENTS["variance"].label)
-    error, samples = GRADIENTS["relative_error"].heading, counted(int(part["samples"]), "sample")
+    error, samples = GRADIENTS["relative_error"].heading, plural(int(part["samples"]), "sample")
     axes[1, 0].set_ylabel(f"{error} of the mean\nof {samples}")
     return figure
 
@@ -88,7 +88,7 @@ def variance(part: xr.Dataset, title: str) -> Figure:
         if not sane(part, ["variance"]).all() and (ends := limits(part, ["variance"], 10.0)):
             axes.set_ylim(ends)
 
-    seeds = counted(part.sizes["seed"], "seed")
+    seeds = plural(part.sizes["seed"], "seed")
     return against_stiffness(part, f"{title}\nvariance ({seeds}, 95 % intervals)", GRADIENTS["variance"].label, draw)
 
 
@@ -142,7 +142,7 @@ def alpha(part: xr.Dataset, title: str) -> Figure | None:
             mark_undrawn(axes, x, np.where(values.notnull().any("seed"), 1.0, np.nan), style)
         axes.set_ylim(-0.03, 1.03)
 
-    seeds = counted(part.sizes["seed"], "seed")
+    seeds = plural(part.sizes["seed"], "seed")
     title = f"{title}\nweight of first-order gradients (mean and range of {seeds})"
     return against_stiffness(weighed, title, GRADIENTS["alpha"].label, draw, log=False)
 

@@ -67,10 +67,6 @@ def number(value: Any, digits: int = 4) -> str:
     return f"{value:,.0f}" if digits <= 4 and 1000 <= value < 1e6 else f"{value:.{digits}g}"
 
 
-def counted(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
 def model_title(one: xr.Dataset, between: str = ", ") -> str:
     """Name of a contact model, with its stiffness if it has one."""
     family, stiffness = str(one["contact"].item()), float(one["stiffness"])

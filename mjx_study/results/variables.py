@@ -78,7 +78,9 @@ GRADIENTS: Final = {
     "seconds_per_sample": Variable(EACH, "s", "computing time of one sample, without compilation", "ms", 2),
     "onsets": Variable(EACH, "1", "onsets of contact in the first-order batches", digits=0),
     "onsets_bounded": Variable(EACH, "1", "onsets at grazing speed, with a bounded term", digits=0),
-    "onsets_missed": Variable(EACH, "1", "onsets without a term", digits=0),
+    "onsets_missed": Variable(
+        EACH, "1", "events without a term: of chattering contacts, or beyond the slots", digits=0
+    ),
     "onset_strength": Variable(
         EACH, "1", "share of the approach speed that an onset takes in a step, root mean square"
     ),

@@ -70,7 +70,8 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
         found.append(f"these numbers were computed with other versions ({told}); use another folder to recompute them")
     counted = {
         "unconverged": "rollouts in which the contact solver did not converge",
-        "onsets_missed": "onsets of contact have no term, since their rollouts have too many",
+        "onsets_missed": "events of contact have no term and are left to plain first order: they chatter, or their "
+        "rollouts have too many",
         "onsets_replaced": "contact points of corners or edges appear or vanish in penetration and have no term: "
         "means with the onset term may be off",
         "onsets_bounded": "onsets of contact are grazing, and their terms are bounded",

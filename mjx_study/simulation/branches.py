@@ -76,29 +76,32 @@ def jump_term(
     slots = len(events.used)
     filled = jnp.sum(events.used)
     weights = jnp.zeros((slots, 2, scene.host.nv), before.qpos.dtype)
-    flags = jnp.zeros((slots, 2), bool)
+    flags, rates = jnp.zeros((slots, 2), bool), jnp.zeros(slots, before.qpos.dtype)
 
     def fill(carry):
-        slot, weights, flags = carry
-        weight, flag = _weights(
-            scene, model, before, controls, cost_to_go, jax.tree.map(lambda leaf: leaf[slot], events)
-        )
-        return slot + 1, weights.at[slot].set(weight), flags.at[slot].set(flag)
+        slot, *found = carry
+        event = jax.tree.map(lambda leaf: leaf[slot], events)
+        own = _weights(scene, model, before, controls, cost_to_go, event)
+        return slot + 1, *(every.at[slot].set(one) for every, one in zip(found, own, strict=True))
 
     # not a scan: the loop over a batch ends with the last event of any rollout
-    _, weights, flags = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, (jnp.zeros((), int), weights, flags))
+    start = jnp.zeros((), int), weights, flags, rates
+    _, weights, flags, rates = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, start)
+    chatters = events.chattering(rates, scene.timestep)
+    weights = jnp.where(chatters[:, None, None], 0.0, weights)
     at = jnp.stack([events.step, events.step - 1], axis=1)
     moved = jax.vmap(jax.vmap(lambda fixed, here: difference_position(scene.host, fixed, here)))(
         before.qpos[at], states.qpos[at]
     )
     narrow, valid = flags.T
-    return jnp.sum(weights * moved), events.counts(past, valid, narrow, jnp.zeros(slots, weights.dtype))
+    return jnp.sum(weights * moved), events.counts(past, valid, narrow, jnp.zeros(slots, weights.dtype), chatters)
 
 
 def _weights(
     scene: Scene, model: mjx.Model, before: State, controls: Controls, cost_to_go: CostToGo, event: Events
-) -> tuple[Float[Array, "2 nv"], Bool[Array, " 2"]]:
-    """(1 - s) J_k n / D and s J_{k-1} n / D of one event; whether its cell is too narrow, and whether it is valid."""
+) -> tuple[Float[Array, "2 nv"], Bool[Array, " 2"], Scalar]:
+    """(1 - s) J_k n / D and s J_{k-1} n / D of one event; whether its cell is too narrow, and whether it is valid; and
+    its relaxation rate."""
     host, timestep = scene.host, scene.timestep
     qpos, qvel = before.qpos[event.step], before.qvel[event.step]
     touch = with_solver(at_touch, model, scene.template, qpos, qvel, event)
@@ -119,4 +122,5 @@ def _weights(
     normal, least = first.normal, least_travel(model, first, event.ends)
     cell, (last, earlier) = -jnp.maximum(jnp.abs(touch.travel), least), touch.weights
     weights = jnp.stack([last * here, earlier * previous])[:, None] * normal / cell
-    return jnp.where(touch.valid, weights, 0.0), jnp.stack([touch.valid & (jnp.abs(touch.travel) < least), touch.valid])
+    flags = jnp.stack([touch.valid & (jnp.abs(touch.travel) < least), touch.valid])
+    return jnp.where(touch.valid, weights, 0.0), flags, first.rate

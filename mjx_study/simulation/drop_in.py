@@ -174,8 +174,8 @@ def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Preceding:
 def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Preceding) -> mjx.Data:
     """`mjx.step` with the same values, but derivatives that include the onset term.
 
-    Delta_k replaces Delta_{k-1}, which the state does not contain: an error of order h in the term. No
-    contact begins or ends at time 0, which no step precedes.
+    Delta is that from the velocity of step k, since the state does not contain the one before: an error of order h in
+    the term. No contact begins or ends at time 0, which no step precedes.
     """
     timestep, fixed = model.opt.timestep, jax.lax.stop_gradient(data)
     moved = difference_position(model, fixed.qpos, data.qpos)

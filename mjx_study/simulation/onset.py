@@ -9,15 +9,17 @@ cost has a second part, from rollouts at which the index changes:
 with V the cost to go. A rollout in which contact begins at step k has phi_k in (D, 0], where n = d phi / dq and
 D = phi_k - phi_{k-1} = h n^T v_k. It lies between two others: one in which contact only just begins at step k
 (phi_k = 0), and one in which it would have begun at step k - 1 (phi_{k-1} = 0). If phi is uniform over this cell,
-linear interpolation gives the weights of both, and no extra rollout is needed. With s = phi_k/D and Delta_k the
-velocity jump after step k,
+linear interpolation gives the weights of both, and no extra rollout is needed. With s = phi_k/D and Delta the velocity
+jump after a step from the touch,
 
-    dx_{k+1} = A_k dx_k + (1 - s) Delta_k (n^T dq_k) / D + s A_k (h Delta_{k-1}, Delta_{k-1}) (n^T dq_{k-1}) / D,
+    dx_{k+1} = A_k dx_k + (1 - s) Delta (n^T dq_k) / D + s A_k (h Delta, Delta) (n^T dq_{k-1}) / D,
 
-where n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme. Its error is O(h^2);
-the first weight alone (s = 0) leaves an error of h b, where b is the contact's damping [1/s]. Where contact ends under
-force, phi_k lies in [0, D), and the terms have the other sign. `touch.at_touch` finds s and the speed at touch where
-the normal turns within the step, and the weights of contacts that are shorter.
+where n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme. The two jumps are
+those from the velocities before steps k and k - 1; Delta is that from (1 - s) v_k + s v_{k-1}, so that the errors of
+both terms cancel. What is left is O(h^2); the first weight alone (s = 0) leaves an error of h b, where b is the
+contact's damping [1/s]. Where contact ends under force, phi_k lies in [0, D), and the terms have the other sign.
+`touch.at_touch` finds s and the speed at touch where the normal turns within the step, and the weights of contacts
+that are shorter.
 
 Not covered: initial contact; features of a geom whose contact point jumps.
 
@@ -122,7 +124,8 @@ def corrected(
     First derivatives with respect to initial state and controls, in forward and reverse mode.
 
     Args:
-        model: the model to step; may be traced, but not differentiated (TypeError).
+        model: the model to step; may be traced, but not differentiated (TypeError); `drop_in.step` has derivatives
+            over it.
         slots: maximum number of events to correct, earliest first; by default `slots_for` the scene.
         weight: factor of the term; 0 gives the derivatives of `dynamics.simulated`.
     """
@@ -206,7 +209,7 @@ class Terms(NamedTuple):
     """Terms of events.
 
     Attributes:
-        spread, shift: (1 - s) Delta_k / D and s Delta_{k-1} / D.
+        spread, shift: (1 - s) Delta / D and s Delta / D.
         slope: n, the derivative of the guard's distance.
     """
 
@@ -253,8 +256,10 @@ def _corrections(
     grouped = jax.tree.map(lambda leaf: jnp.resize(leaf, (-(-slots // math.prod(few)), *few, *leaf.shape[1:])), events)
     _, each = jax.lax.scan(fill, None, grouped)
     flat = lambda leaf: leaf.reshape(-1, *leaf.shape[1 + len(few) :])[:slots]  # noqa: E731
-    terms, strength, narrow, valid = jax.tree.map(flat, each)
-    return terms, events.counts(past, valid, narrow, strength)
+    terms, strength, narrow, valid, rate = jax.tree.map(flat, each)
+    chatters = events.chattering(rate, scene.timestep)
+    spread, shift = (jnp.where(chatters[:, None], 0.0, part) for part in (terms.spread, terms.shift))
+    return terms._replace(spread=spread, shift=shift), events.counts(past, valid, narrow, strength, chatters)
 
 
 Moving = Mapping[int, Array]
@@ -271,9 +276,9 @@ def onset_term(
     controls: Float[Array, "cases nu"],
     event: Events,
     moving: Moving = MappingProxyType({}),
-) -> tuple[Terms, Scalar, Bool[Array, ""], Bool[Array, ""]]:
-    """Term of an event, share of the approach speed lost, whether D was bounded, and whether the contact begins or ends
-    by motion within the step; zeros and False otherwise.
+) -> tuple[Terms, Scalar, Bool[Array, ""], Bool[Array, ""], Scalar]:
+    """Term of an event, share of the approach speed lost (see `OnsetCounts`), whether D was bounded, and whether the
+    contact begins or ends by motion within the step; zeros and False otherwise. Last, `guards.relaxation_rate`.
 
     Delta is v'(on) - v'(off) at first touch, and n the derivative of the guard's distance over the nv coordinates, then
     over the entries of the model's moving leaves.
@@ -289,24 +294,23 @@ def onset_term(
     qpos, qvel = states.qpos[0], states.qvel[0]
     touch: Touch = call(at_touch, model, template, qpos, qvel, event)
 
-    found: list[Passages] = []
-    for at in range(len(states.qvel)):
-        # the solution of one case is close to that of the other
-        warmstart = found[-1].qacc if found else jnp.broadcast_to(states.warmstart, (2, len(qvel)))
-        before = states.qvel[at], states.act[at], controls[at], warmstart
-        found.append(call(passages, model, template, touch.qpos, qvel, *before, event))
-    jumps = [each.qvel[0] - each.qvel[1] for each in found]
-    least, normal = least_travel(model, found[0], event.ends), found[0].normal
+    # between the two, as far from step k as the touch is
+    since = jnp.clip(touch.share, 0, 1)
+    at_once = lambda leaf: leaf[0] if len(leaf) == 1 else (1 - since) * leaf[0] + since * leaf[1]  # noqa: E731
+    before = *map(at_once, (states.qvel, states.act, controls)), jnp.broadcast_to(states.warmstart, (2, len(qvel)))
+    found: Passages = call(passages, model, template, touch.qpos, qvel, *before, event)
+    jump, normal = found.qvel[0] - found.qvel[1], found.normal
+    least = least_travel(model, found, event.ends)
     cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
-    last, before = touch.weights
+    last, earlier = touch.weights
     slope = normal
     if moving:
         positioned = fwd_position(model, template.replace(qpos=touch.qpos))
         slope = jnp.concatenate([normal, _slope_over(moving, model, positioned, qvel, event)])
-    strength = -model.opt.timestep * (normal @ jumps[0]) / cell
-    term = Terms(last * jumps[0] / cell, before * jumps[-1] / cell, slope)
+    strength = jnp.maximum(-model.opt.timestep * (normal @ jump) / cell, (model.opt.timestep * found.rate) ** 2)
+    term = Terms(last * jump / cell, earlier * jump / cell, slope)
     term, strength = jax.tree.map(lambda each: jnp.where(valid, each, 0.0), (term, strength))
-    return term, strength, valid & (jnp.abs(touch.travel) < least), valid
+    return term, strength, valid & (jnp.abs(touch.travel) < least), valid, found.rate
 
 
 def with_run_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
@@ -474,4 +478,7 @@ def without_derivative(model: mjx.Model) -> mjx.Model:
     return whole(_of_states_only(traced))
 
 
-_of_states_only = refusing("the onset term has derivatives over states and controls, but not over the model")
+_of_states_only = refusing(
+    "the onset term of rollouts has derivatives over states and controls, but not over the model: "
+    'mjx_study.step(model, data, onset="linear") has both'
+)

@@ -18,6 +18,14 @@ TOUCHING_SHARE: Final = 1e-6
 """Share of a cell: a body closer than this before the step was already touching, so there is no onset."""
 NEAR_TOUCH: Final = 0.1
 """Share of the way from the touch to the state in contact at which the contact's geometry is evaluated."""
+LEAST: Final = 8
+"""Number of events of a contact in a row from which it chatters: a ball in a corner rarely has as many."""
+CHATTER: Final = 2.2
+"""Time between two events of a contact below which they belong together, in the time that contact takes to slow a body
+down, 1 / `guards.relaxation_rate`: a little more than `solref`'s time constant where damping is critical."""
+
+LONG_AGO: Final = 1_000_000
+"""Steps before the first event of a contact."""
 
 
 Flags = Bool[Array, " slots"]
@@ -31,9 +39,10 @@ class OnsetCounts:
     Attributes:
         found: onsets of contacts and limits, and missed events.
         bounded: onsets and ends at grazing speed, whose term is bounded.
-        missed: events left uncorrected for lack of slots.
-        strength: root-mean-square share of the approach speed that a corrected onset removes in one step; 0 if there is
-            none, and with the jump, whose error does not depend on it.
+        missed: events left uncorrected, for lack of slots or because their contact chatters (`Events.chattering`).
+        strength: root-mean-square share of the approach speed that a corrected onset removes in one step, by the force
+            at touch or by the spring at the depth of a step, h^2 k d, whichever is more; 0 if there is none, and with
+            the jump, whose error does not depend on it.
         first: step of the first onset; NaN if there is none.
         replaced: contact points of corners and edges that appear or vanish without their distance passing zero, for
             which there is no term.
@@ -75,15 +84,52 @@ class Events:
     touching: Bool[Array, "*slots guards"]
     used: Bool[Array, "*slots"]
 
+    def chattering(self, rate: Float[Array, " slots"], timestep: float | Scalar) -> Flags:
+        """Events of contacts that begin and end again and again: in a row of `LEAST` or more, each soon after the last.
+
+        The derivatives of such a row multiply by about n^T dq / D at each event, and so does the variance of the term.
+
+        Args:
+            rate: relaxation rate of each event's contact [1/s].
+        """
+        guards = jnp.arange(self.absent.shape[-1])
+        own = lambda here, every: jnp.sum(jnp.where(here, every, 0), dtype=every.dtype)  # noqa: E731
+
+        def forwards(carry: tuple[Array, Array], event: tuple[Array, ...]) -> tuple[Any, Array]:
+            """Number of an event in its row."""
+            last, numbers = carry
+            step, guard, used, rate = event
+            here = (guards == guard) & used
+            soon = (step - own(here, last)) * timestep * rate < CHATTER
+            number = jnp.where(soon, own(here, numbers), 0) + 1
+            return (jnp.where(here, step, last), jnp.where(here, number, numbers)), number
+
+        def backwards(carry: tuple[Array, Array], event: tuple[Array, ...]) -> tuple[Any, Array]:
+            """Length of its row, which the next event of the contact continues if it has the next number."""
+            following, lengths = carry
+            number, guard, used = event
+            here = (guards == guard) & used
+            continued = own(here, following) == number + 1
+            length = jnp.where(continued, own(here, lengths), number)
+            return (jnp.where(here, number, following), jnp.where(here, length, lengths)), length
+
+        zeros = jnp.zeros(len(guards), self.step.dtype)
+        events = self.step, self.guard.astype(zeros.dtype), self.used, rate
+        _, number = jax.lax.scan(forwards, (zeros - LONG_AGO, zeros), events)
+        _, length = jax.lax.scan(backwards, (zeros, zeros), (number, *events[1:3]), reverse=True)
+        return self.used & (length >= LEAST)
+
     def counts(
         self,
         past: "Past",
         valid: Flags,
         narrow: Flags,
         strength: Float[Array, " slots"],
+        chatters: Flags,
     ) -> OnsetCounts:
         """Counts of a rollout, from what is known at its end and from what the term says of these events."""
-        missed = past.events - jnp.sum(self.used)
+        missed = past.events - jnp.sum(self.used) + jnp.sum(valid & chatters)
+        valid, narrow = valid & ~chatters, narrow & ~chatters
         begins = valid & ~self.ends
         onsets = jnp.sum(begins)
         first = jnp.min(jnp.where(begins, self.step.astype(strength.dtype), jnp.inf), initial=jnp.inf)

@@ -173,6 +173,15 @@ def test_squared_bias_from_batch_means_is_unbiased_and_its_interval_holds(offset
     assert all(np.isnan(number) for number in few)
 
 
+def test_squared_bias_of_numpys_arrays_compiles_nothing() -> None:
+    means, reference = jax.random.normal(jax.random.key(0), (5, 3)), summarise(jnp.eye(3))
+    expected = squared_bias_of_means(means, reference)
+    host, held = np.asarray(means), jax.device_get(reference)
+    with jax.no_tracing():
+        found = squared_bias_of_means(host, held)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
 # Samples with a known mean; "jump" is a zeroth-order sample of the Heaviside function under Laplace noise, which is
 # bounded. A bound R on ||g - E g||, or None.
 DISTRIBUTIONS = {

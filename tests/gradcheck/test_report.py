@@ -85,11 +85,6 @@ def test_each_stage_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert stages_of(capsys.readouterr().err) == ["[0/2] compiling", "[1/2] penalty: start"]
 
 
-def test_unresolved_entries_are_counted() -> None:
-    header, row = report(STEP).lines()[3:5]
-    assert dict(zip(header.split()[-2:], row.split()[-2:], strict=True)) == {"unresolved": "7", "verdict": "right"}
-
-
 @pytest.mark.parametrize(
     ("verdict", "fails", "text"),
     [

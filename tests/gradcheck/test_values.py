@@ -13,10 +13,11 @@ import pytest
 
 from mjx_study.gradcheck import coordinates as layouts
 from mjx_study.gradcheck.coordinates import Coordinates, make_coordinates
-from mjx_study.gradcheck.programs import ContactCase, Programs, _stages
-from mjx_study.gradcheck.values import EngineStep, Values, compare_values, difference_of_engines
+from mjx_study.gradcheck.engine_difference import difference_of_engines
+from mjx_study.gradcheck.engine_step import EngineStep
+from mjx_study.gradcheck.programs import ContactCase, Exact, Programs
+from mjx_study.gradcheck.values import Values, compare_values
 from mjx_study.simulation import integration, patches
-from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import contact_model
 from mjx_study.simulation.engine import HostState, host_data
 from mjx_study.simulation.scene import put_scene
@@ -31,6 +32,19 @@ PLAIN = SERVO.replace('forcerange="-1 1"', "")
 @cache
 def layout(xml: str = PLAIN) -> Coordinates:
     return make_coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
+
+
+def at(qpos: Any, qvel: Any) -> HostState:
+    """A state without activations and controls, and with no warm start."""
+    qpos, qvel = np.asarray(qpos), np.asarray(qvel)
+    return HostState(qpos, qvel, np.zeros(0), np.zeros(0), np.zeros(len(qvel)))
+
+
+def exact_step(programs: Programs, state: HostState) -> Exact:
+    """This project's step, and MJX's quantities in it."""
+    own = programs.layout
+    case, still = ContactCase(None, own.scales), np.zeros((1, len(own.inputs)))
+    return programs.exact(case, state, jnp.asarray(state.qpos), still)
 
 
 def start(xml: str = PLAIN) -> HostState:
@@ -104,7 +118,7 @@ def test_the_engines_step_changes_as_the_layout_says(index: int) -> None:
     change[both.num_state + index % 7] = 0.25
     model = both.model(contact, jnp.asarray(both.scales), jnp.asarray(change[both.num_state :]))
     engine = EngineStep(both, contact)
-    engine._set_parameters(change[both.num_state :] * both.scales)
+    engine.set_parameters(change[both.num_state :] * both.scales)
     for name in ("geom_solref", "geom_solimp", "geom_friction", "pair_solref", "pair_solimp", "pair_friction"):
         np.testing.assert_allclose(getattr(engine.host, name), np.asarray(getattr(model, name)), atol=1e-15)
 
@@ -125,9 +139,9 @@ def value_check(xml: str, qpos: list[float], qvel: list[float], **doctored: Any)
     """The values of one step, with planted faults and other quantities in place of MJX's."""
     own = layout(xml)
     programs, case = Programs(own), ContactCase(None, own.scales)
-    state = HostState(np.array(qpos), np.array(qvel), np.zeros(0), np.zeros(0), np.zeros(len(qvel)))
+    state = at(qpos, qvel)
     for _ in range(2):  # the second time from the solution
-        exact = programs.exact(case, state, jnp.asarray(qpos), np.zeros((1, len(own.inputs))))
+        exact = exact_step(programs, state)
         state = dataclasses.replace(state, warmstart=exact.after.warmstart)
     stock = programs.stock_step(case, state)
     return compare_values(own, EngineStep(own, None), state, exact.after, stock, exact.stages | doctored)
@@ -185,21 +199,13 @@ MOVING = np.array([0.5, -0.3, 0.2, 0.4, -0.1, -0.2, 0.3, -0.3])
 @cache
 def mixed_stages() -> dict[str, Any]:
     """MJX's quantities."""
-    scene = layout(MIXED).scene
-
-    def forward(data: mjx.Data) -> dict[str, Any]:
-        data = mjx.fwd_velocity(scene.model, mjx.fwd_position(scene.model, data))
-        data = mjx.fwd_acceleration(scene.model, mjx.fwd_actuation(scene.model, data))
-        return _stages(scene.model, data)
-
-    return jax.tree.map(np.asarray, jax.jit(forward)(scene.template.replace(qpos=BENT, qvel=MOVING)))
+    return exact_step(Programs(layout(MIXED)), at(BENT, MOVING)).stages
 
 
 def mixed_difference(stages: dict[str, Any]) -> tuple[str, bool]:
     """The difference reported for another constrained acceleration."""
-    nothing = np.zeros(0)
-    state = HostState(BENT, MOVING, nothing, nothing, 0 * MOVING)
-    return difference_of_engines(EngineStep(layout(MIXED), None).host, state, stages, MOVING, 0 * MOVING)
+    host = EngineStep(layout(MIXED), None).host
+    return difference_of_engines(host, at(BENT, MOVING), stages, MOVING, 0 * MOVING)
 
 
 def test_rows_are_compared_whatever_their_order() -> None:
@@ -260,9 +266,7 @@ def test_mjx_stops_what_turns_slower_than_it_sees(speed: float, verdict: str | N
     """Below 1e-8 rad/s MJX leaves an orientation as it is."""
     xml = '<mujoco><worldbody><body><joint type="ball"/><geom size=".1"/></body></worldbody></mujoco>'
     own = layout(xml)
-    state = HostState(
-        np.array([1.0, 0.0, 0.0, 0.0]), np.array([speed, 0.0, 0.0]), np.zeros(0), np.zeros(0), np.zeros(3)
-    )
+    state = at([1.0, 0.0, 0.0, 0.0], [speed, 0.0, 0.0])
     after = EngineStep(own, None).after(state)
     stopped = dataclasses.replace(after, qpos=state.qpos)
     assert compare_values(own, EngineStep(own, None), state, after, stopped, {}).verdict == verdict
@@ -276,7 +280,7 @@ RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0
 def test_nonfinite_quantities_differ(name: str) -> None:
     """They are compared nevertheless, without a traceback."""
     host = mujoco.MjModel.from_xml_string(RESTING)
-    state = HostState(host.qpos0.copy(), np.zeros(6), np.zeros(0), np.zeros(0), np.zeros(6))
+    state = at(host.qpos0, np.zeros(6))
     engine = EngineStep(make_coordinates(put_scene(host, "box"), None), None)
     data = host_data(engine.host, state)
     mujoco.mj_forward(engine.host, data)

@@ -1,0 +1,125 @@
+"""Table of docs/native.md: tasks as native code and through XLA, on this machine.
+
+    python -m experiments.native TASK ...    # all of `TASKS` without names; each route in a process of its own
+    python -m experiments.native --page      # only the page
+
+Rates are those of the fastest of several calls, with the inputs on the device. Building is the time to the first
+result of a process with empty caches, tracing included. A route that takes longer than `MOST_SECONDS` counts as such.
+"""
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any, Final
+
+import jax
+import numpy as np
+
+from experiments import DATA, DOCS
+from experiments.pages import write_tables
+from mjx_study.graph.native import SWITCH
+from mjx_study.graph.scans import with_native_scans
+from mjx_study.objective import SamplePrograms
+from mjx_study.runtime import configure
+from mjx_study.simulation.contact import family_model
+from mjx_study.table import markdown_table
+from mjx_study.tasks import make_task
+
+RESULTS: Final = DATA / "native.jsonl"
+TASKS: Final = ("pusher", "sliding_box", "ball_wall", "momentum_transfer", "tennis", "gripper", "landing")
+KINDS: Final = {"value": "rollouts", "gradient": "gradients", "corrected": "corrected gradients"}
+SAMPLES: Final = {"cpu": 1000, "gpu": 98_304}
+MOST_SECONDS: Final = 300
+"""Maximum time for a route."""
+REPEATS: Final = 7
+
+
+def measured(name: str) -> dict[str, Any]:
+    """Measure a task by the route of this process: by kind, million steps per second and the time to a result [s]."""
+    configure()
+    task, platform = make_task(name), jax.default_backend()
+    contact = family_model("mujoco_default", task.scene, effective_mass=task.effective_mass)
+    size, found = SAMPLES[platform], {}
+    keys = jax.random.key_data(jax.random.split(jax.random.key(0), size))
+    arguments = jax.device_put((task.theta, contact, np.asarray(task.sigma), keys, np.ones(size)))
+    for kind in KINDS:
+        begun = time.perf_counter()
+        each = SamplePrograms(task.replace(onset="linear" if kind == "corrected" else "none")).by_name[
+            "value" if kind == "value" else "gradient"
+        ]
+        program = jax.jit(jax.vmap(with_native_scans(each), (None, None, None, 0, 0)))
+        jax.block_until_ready(program(*arguments))
+        built, best = time.perf_counter() - begun, math.inf
+        for _ in range(REPEATS):
+            begun = time.perf_counter()
+            jax.block_until_ready(program(*arguments))
+            best = min(best, time.perf_counter() - begun)
+        found[kind] = {"rate": size * task.horizon / best / 1e6, "built": built}
+        print(json.dumps(found), flush=True)
+    return found
+
+
+def main() -> None:
+    """Measure tasks, and write the page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("tasks", nargs="*", default=TASKS)
+    parser.add_argument("--page", action="store_true", help="only write the page")
+    parser.add_argument("--route", action="store_true", help="measure one task by the route of this process")
+    parser.add_argument("--into", default=RESULTS, help="file of results")
+    given = parser.parse_args()
+    if given.route:
+        measured(*given.tasks)
+        return
+    for name in () if given.page else given.tasks:
+        for switch in "10":
+            with tempfile.TemporaryDirectory() as folder:
+                environment = os.environ | {SWITCH: switch, "XDG_CACHE_HOME": folder}
+                command = [sys.executable, "-m", "experiments.native", "--route", name]
+                try:
+                    done = subprocess.run(
+                        command, env=environment, stdout=subprocess.PIPE, text=True, timeout=MOST_SECONDS
+                    )
+                    lines = done.stdout.splitlines()
+                except subprocess.TimeoutExpired as error:
+                    lines = (error.stdout or b"").decode().splitlines()
+            found = json.loads(lines[-1]) if lines else {}
+            row = {"task": name, "native": switch == "1", "platform": jax.default_backend(), "found": found}
+            with open(given.into, "a") as file:
+                file.write(json.dumps(row) + "\n")
+            print(row, flush=True)
+    if given.into == RESULTS:
+        write_page()
+
+
+def write_page() -> None:
+    """Write the tables of docs/native.md, from the last measurement of each task, route and platform."""
+    rows = {(each["platform"], each["task"], each["native"]): each["found"] for each in map(json.loads, open(RESULTS))}
+    tables = {}
+    for platform in SAMPLES:
+        lines = []
+        for name in dict.fromkeys(task for where, task, _ in rows if where == platform):
+            ours, theirs = (rows.get((platform, name, native), {}) for native in (True, False))
+            cells = [f"`{name}`"]
+            for kind in KINDS:
+                native, other = (each[kind]["rate"] if kind in each else math.nan for each in (ours, theirs))
+                cells.append(" / ".join(map(_number, (native, other))) + f" = {native / other:.1f}")
+            whole = (
+                sum(each[kind]["built"] for kind in KINDS) if len(each) == 3 else math.nan for each in (ours, theirs)
+            )
+            lines.append([*cells, " / ".join(map(_number, whole))])
+        header = ["task", *KINDS.values(), "building [s]"]
+        tables[f"native, {platform}"] = markdown_table(lines, header).replace(" / - = nan", "").replace(" / -", "")
+    write_tables(DOCS / "native.md", tables)
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+
+
+if __name__ == "__main__":
+    main()
