@@ -44,7 +44,9 @@ def _times(found: Cells) -> str:
         cells = [found.get((name, scene, TIMESTEPS[0]), {}) for scene in SCENES]
         times = [cell.get("seconds_per_gradient") for cell in cells]
         if any(times):
-            rows.append(markdown_row(engine.label, *(f"{1000 * time:.2g}" if time else "-" for time in times)))
+            rows.append(
+                markdown_row(engine.label, *(f"{float(f'{1000 * time:.2g}'):g}" if time else "-" for time in times))
+            )
     return "\n".join(rows)
 
 
