@@ -12,11 +12,11 @@ import pytest
 
 from experiments import ROOT
 from experiments.engines import __main__ as command
-from experiments.engines import catalog, certify, references
+from experiments.engines import catalog, certify, references, worker
 from experiments.engines.adapters import mujoco_family
 from experiments.engines.judge import combined, measure, verdict
-from experiments.engines.page import CELLS, PAGE, cells, tables
-from experiments.engines.scenes import RADIUS, SCENES, mjcf
+from experiments.engines.page import CELLS, CHECKS, PAGE, cells, tables
+from experiments.engines.scenes import RADIUS, SCENES, TIMESTEPS, Rollout, mjcf
 from experiments.pages import replace_tables
 
 SMALL = {"grid": 100, "strata": 100, "points": 20}
@@ -66,14 +66,45 @@ def test_verdicts(changes: dict[str, Any], said: str) -> None:
 def test_a_scene_that_an_engine_lacks_is_a_dash_with_a_reason() -> None:
     lacking = {"error": "knows no walls"}
     assert combined([lacking, None]) == "-"
-    said = tables({("jaxsim", "wall", 0.005): lacking})
+    said = tables({("jaxsim", "wall", 0.005): lacking}, {})
     assert f"| {catalog.ENGINES['jaxsim'].label} | wall | knows no walls |" in said["reasons"]
     assert "JaxSim" not in said["wall"]
 
 
 def test_the_page_says_what_the_data_give() -> None:
     text = PAGE.read_text()
-    assert replace_tables(text, tables(cells(CELLS))) == text
+    assert replace_tables(text, tables(cells(CELLS), cells(CHECKS))) == text
+
+
+def test_times_and_versions_are_those_of_the_cells() -> None:
+    old = RIGHT | {"seconds_per_gradient": 0.0123}
+    found = {("brax_spring", "toss", 0.005): old | {"versions": {"jax": "1.2", "mujoco": "3.4"}}}
+    found |= {("brax_spring", "wall", step): old for step in TIMESTEPS}
+    said, label = tables(found, {}), catalog.ENGINES["brax_spring"].label
+    pins = " ".join(catalog.ENVIRONMENTS["brax"].packages)
+    assert said["versions"].splitlines()[2:] == [f"| {label} | MuJoCo 3.4, JAX 1.2 (1); not recorded (2) | {pins} |"]
+    assert said["times"].splitlines()[2:] == [f"| {label} | 12 | - | - | 12 | - | - | - | - |"]
+
+
+def test_accusing_cells_are_accused_under_half_the_noise() -> None:
+    checks, found = cells(CHECKS), cells(CELLS)
+    assert set(checks) == set(command.CHECKED)
+    assert {verdict(each) for key, cell in checks.items() for each in (cell, found[key])} == {"biased"}
+
+
+def test_half_the_noise_is_half(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    seen = []
+
+    def rollouts(scene, timestep, variant):
+        seen.append((scene.sigma, timestep, variant))
+        return lambda thetas: Rollout(thetas, np.ones(len(thetas)), np.tile([0.0, 0.0, 1.0], (len(thetas), 1, 1)))
+
+    monkeypatch.setattr(mujoco_family, "build", rollouts)
+    for how in ([], ["half"]):
+        monkeypatch.setattr(sys, "argv", ["worker", "mjx", "toss", "0.005", "quick", *how])
+        worker.main()
+    assert seen == [(SCENES["toss"].sigma / share, 0.005, "forward") for share in (1, 2)]
+    assert [verdict(json.loads(line)) for line in capsys.readouterr().out.splitlines()] == ["right"] * 2
 
 
 @pytest.mark.parametrize("name", ["slide", "box_flat"])
@@ -127,7 +158,7 @@ print(json.dumps([found.positions[0, 0].tolist(), float(found.values[0]), float(
 """
 
 
-@pytest.mark.parametrize("name", ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap", "nimble"])
+@pytest.mark.parametrize("name", ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap", "nimble", "mujoco_torch_plain"])
 def test_free_flight_of_what_is_installed(name: str) -> None:
     engine = catalog.ENGINES[name]
     python = catalog.interpreter(engine)

@@ -5,6 +5,7 @@ data/engines.jsonl a line per cell, so that the same command resumes; --quick ha
 build/engines/quick.jsonl, which no page is made of. --jobs N measures N cells at a time, each on one core.
 --here runs all in this interpreter in place of the engines' environments, and --into FILE keeps what is new apart:
 so a machine without a network measures what its PYTHONPATH has, and `merge FILE ...` adds that to the data.
+python -m experiments.engines check: repeats accusing cells under half the noise, into data/engines_checks.jsonl.
 python -m experiments.engines page: writes the tables of docs/engines.md.
 """
 
@@ -23,7 +24,7 @@ from typing import Final
 
 from experiments import ROOT
 from experiments.engines.catalog import ENGINES, HOME, interpreter
-from experiments.engines.page import CELLS, PAGE, cells, tables
+from experiments.engines.page import CELLS, CHECKS, PAGE, cells, tables
 from experiments.engines.scenes import SCENES, TIMESTEPS
 from experiments.pages import write_tables
 
@@ -31,12 +32,15 @@ LIMIT = 900
 """Seconds that a cell may take."""
 ONE_CORE: Final = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
 """Of cells of which several are measured at a time."""
+CHECKED: Final = tuple(itertools.product(("mjx", "brax_positional", "drake_sap"), ("toss",), TIMESTEPS))
+"""Accusing cells that `check` repeats."""
 
 
 def run(arguments: argparse.Namespace, target: Path) -> int:
     """Measure what the data and `target` lack, and return how many cells failed."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    found = {**({} if arguments.quick else cells(CELLS)), **cells(target)}
+    apart = arguments.quick or arguments.what == "check"
+    found = {**({} if apart else cells(CELLS)), **cells(target)}
     todo = []
     for name in arguments.only or ENGINES:
         python = Path(sys.executable) if arguments.here else interpreter(ENGINES[name])
@@ -44,7 +48,8 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
             print(f"{name}: not installed, skipped: python -m experiments.engines.install {ENGINES[name].environment}")
             continue
         every = itertools.product(arguments.scene or SCENES, arguments.timestep or TIMESTEPS)
-        todo += [(python, name, scene, str(step)) for scene, step in every if (name, scene, step) not in found]
+        keys = [(name, *each) for each in every if arguments.what != "check" or (name, *each) in CHECKED]
+        todo += [(python, *key[:2], str(key[2])) for key in keys if key not in found]
     writing, cores = Lock(), SimpleQueue()
     pin = arguments.jobs > 1 and shutil.which("taskset") is not None
     for core in itertools.islice(itertools.cycle(sorted(os.sched_getaffinity(0)) if pin else [0]), arguments.jobs):
@@ -53,8 +58,9 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
     def measure(cell: tuple[Path, str, str, str]) -> bool:
         core = cores.get()
         python, *words = cell
-        pinned, quick = ["taskset", "-c", str(core)] * pin, ["quick"] * arguments.quick
-        command = [*pinned, python, "-m", "experiments.engines.worker", *words, *quick]
+        pinned = ["taskset", "-c", str(core)] * pin
+        how = ["quick"] * arguments.quick + ["half"] * (arguments.what == "check")
+        command = [*pinned, python, "-m", "experiments.engines.worker", *words, *how]
         environment = {**os.environ, **ONE_CORE} if arguments.jobs > 1 else None
         said, failed = "measured", False
         try:
@@ -89,7 +95,7 @@ def merge(files: list[Path]) -> None:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m experiments.engines", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=("measure", "page", "merge"), default="measure")
+    parser.add_argument("what", nargs="?", choices=("measure", "check", "page", "merge"), default="measure")
     parser.add_argument("files", nargs="*", type=Path, help="of merge")
     parser.add_argument("--quick", action="store_true", help="a quarter of the rollouts, kept apart from the data")
     parser.add_argument("--only", nargs="+", choices=tuple(ENGINES), help="these engines", metavar="ENGINE")
@@ -100,11 +106,12 @@ def main() -> None:
     parser.add_argument("--into", type=Path, help="file in place of the data")
     arguments = parser.parse_args()
     if arguments.what == "page":
-        write_tables(PAGE, tables(cells(CELLS)))
+        write_tables(PAGE, tables(cells(CELLS), cells(CHECKS)))
     elif arguments.what == "merge":
         merge(arguments.files)
     else:
-        sys.exit(bool(run(arguments, arguments.into or (HOME / "quick.jsonl" if arguments.quick else CELLS))))
+        usual = HOME / "quick.jsonl" if arguments.quick else CHECKS if arguments.what == "check" else CELLS
+        sys.exit(bool(run(arguments, arguments.into or usual)))
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ class Engine:
         adapter: module in `adapters`, and variant.
         how: way of differentiation, as the engine's documentation has it.
         single: whether it computes in float32.
+        slow: whether its cells have fewer rollouts, judge's `FEW`.
     """
 
     label: str
@@ -42,6 +43,7 @@ class Engine:
     variant: str
     how: str
     single: bool = False
+    slow: bool = False
 
 
 ENVIRONMENTS: Final = {
@@ -55,6 +57,9 @@ ENVIRONMENTS: Final = {
     "jaxsim": Environment(("jaxsim==0.9.0", "jax==0.10.2", "jaxlib==0.10.2")),
     "nimble": Environment(("nimblephysics==0.10.52.1", "torch==2.14.1", "numpy<2"), ("3.10",)),
     "drake": Environment(("drake==1.58.0",), ("3.12",)),
+    "mujoco_torch": Environment(
+        ("mujoco-torch==0.2.0", "mujoco==3.5.0", "torch==2.14.1", "tensordict==0.15.3", "numpy<2"), ("3.12", "3.11")
+    ),
 }
 ENGINES: Final = {
     "mjx": Engine("MJX 3.17.0", "own", "mujoco_family", "forward", "forward mode, default solver"),
@@ -84,6 +89,12 @@ ENGINES: Final = {
         for name in ("sap",)
     },
     "nimble": Engine("Nimble 0.10.52", "nimble", "nimble_physics", "lcp", "torch's tape"),
+    **{
+        f"mujoco_torch_{name}": Engine(
+            f"mujoco-torch 0.2.0, {name}", "mujoco_torch", "mujoco_torch_tape", name, how, slow=True
+        )
+        for name, how in (("plain", "torch's tape"), ("soft", "torch's tape, differentiable_mode"))
+    },
     "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode"),
 }
 

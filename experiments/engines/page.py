@@ -1,17 +1,20 @@
 """The tables of docs/engines.md, from data/engines.jsonl alone."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from experiments import DATA, DOCS
-from experiments.engines.catalog import ENGINES
-from experiments.engines.judge import combined
+from experiments.engines.catalog import ENGINES, ENVIRONMENTS
+from experiments.engines.judge import combined, verdict
 from experiments.engines.scenes import SCENES, TIMESTEPS
 from experiments.pages import markdown_row
 
 CELLS: Final = DATA / "engines.jsonl"
+CHECKS: Final = DATA / "engines_checks.jsonl"
+"""Cells under half the noise."""
 PAGE: Final = DOCS / "engines.md"
 Cells = Mapping[tuple[str, str, float], Mapping[str, Any]]
 
@@ -22,14 +25,60 @@ def cells(path: Path) -> Cells:
     return {(each["engine"], each["scene"], each["timestep"]): each for each in map(json.loads, lines)}
 
 
-def tables(found: Cells) -> dict[str, str]:
-    """Return the page's tables: verdicts by engine and scene, and the numbers of each scene."""
+def tables(found: Cells, checks: Cells) -> dict[str, str]:
+    """Return the page's tables: verdicts by engine and scene, each scene's numbers, times, versions, and `checks`."""
     matrix = [markdown_row("engine", "differentiated in", *SCENES), "|---" * (len(SCENES) + 2) + "|"]
     for name, engine in ENGINES.items():
         rows = [[found.get((name, scene, step)) for step in TIMESTEPS] for scene in SCENES]
         verdicts = (combined(row).replace("right", "**right**") for row in rows)
         matrix.append(markdown_row(engine.label, engine.how, *verdicts))
-    return {"matrix": "\n".join(matrix), "reasons": _reasons(found)} | {each: _numbers(found, each) for each in SCENES}
+    kinds = {"matrix": "\n".join(matrix), "reasons": _reasons(found), "times": _times(found)}
+    kinds |= {"versions": _versions(found), "checks": _checks(found, checks)}
+    return kinds | {each: _numbers(found, each) for each in SCENES}
+
+
+def _times(found: Cells) -> str:
+    """Milliseconds per gradient by engine and scene, at the longer timestep."""
+    rows = [markdown_row("engine", *SCENES), "|---" * (len(SCENES) + 1) + "|"]
+    for name, engine in ENGINES.items():
+        cells = [found.get((name, scene, TIMESTEPS[0]), {}) for scene in SCENES]
+        times = [cell.get("seconds_per_gradient") for cell in cells]
+        if any(times):
+            rows.append(
+                markdown_row(engine.label, *(f"{float(f'{1000 * time:.2g}'):g}" if time else "-" for time in times))
+            )
+    return "\n".join(rows)
+
+
+def _versions(found: Cells) -> str:
+    """Versions that the cells of each engine record, with numbers of cells, beside the pins of its environment."""
+    rows = [markdown_row("engine", "measured with (cells)", "pinned"), "|---|---|---|"]
+    names = {"mujoco": "MuJoCo", "jax": "JAX", "torch": "torch"}
+    for name, engine in ENGINES.items():
+        counts: Counter[str] = Counter()
+        for key, cell in found.items():
+            if key[0] == name:
+                with_ = cell.get("versions") or {}
+                counts[", ".join(f"{names[p]} {with_[p]}" for p in names if p in with_) or "not recorded"] += 1
+        if counts:
+            said = "; ".join(f"{versions} ({count})" for versions, count in sorted(counts.items()))
+            pins = " ".join(ENVIRONMENTS[engine.environment].packages).replace("<", "&lt;")
+            rows.append(markdown_row(engine.label, said, pins or "this project's"))
+    return "\n".join(rows)
+
+
+def _checks(found: Cells, checks: Cells) -> str:
+    """Cells under the scene's noise, and under half of it."""
+    rows = [markdown_row("engine", "timestep [ms]", "noise [cm]", "slope", "E[FoBG]", "verdict"), "|---" * 6 + "|"]
+    for (name, scene, step), half in checks.items():
+        for cell, share in ((found.get((name, scene, step)), 1.0), (half, 0.5)):
+            if cell is not None and "slope" in cell:
+                sigma = 100 * share * SCENES[scene].sigma
+                numbers = (_both(cell, "slope", "slope_by_differences"), _both(cell, "mean", "mean_of_strata"))
+                rows.append(
+                    markdown_row(ENGINES[name].label, f"{1000 * step:g}", f"{sigma:g}", *numbers, verdict(cell))
+                )
+    return "\n".join(rows)
 
 
 def _reasons(found: Cells) -> str:
