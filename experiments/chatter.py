@@ -12,22 +12,20 @@ from unittest import mock
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from experiments import DOCS
 from experiments.engines.scenes import SCENES, mjcf, mjcf_state
 from experiments.pages import markdown_row, write_tables
 from experiments.quadruped import walk
+from experiments.starts import task_of_start
 from mjx_study.objective import Simulator
 from mjx_study.objective.programs import SamplePrograms
 from mjx_study.runtime import configure
 from mjx_study.simulation import onset, touch
 from mjx_study.simulation.contact import ContactModel, family_model
-from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import put_scene
+from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
-from mjx_study.tasks.policy import InitialStatePolicy
 from mjx_study.tasks.task import Task
 
 SLOTS: Final = 192
@@ -39,24 +37,13 @@ KINDS: Final = {"none": ("none", 0.0), "all": ("linear", 0.0), "chosen": ("linea
 def slide(timestep: float) -> Task:
     """Return the box of docs/engines.md that slides to rest: its last position by its speed."""
     numbers = SCENES["slide"]
-    scene = put_scene(mujoco.MjModel.from_xml_string(mjcf(numbers, timestep)), "slide")
     qpos, qvel = mjcf_state(numbers, numbers.center)
-    horizon = numbers.steps(timestep)
 
     def start_at(start: State, parameters: jax.Array) -> State:
         return dataclasses.replace(start, qpos=jnp.array(qpos), qvel=jnp.array(qvel).at[0].set(parameters[0]))
 
-    return Task(
-        name="slide",
-        scene=scene,
-        horizon=horizon,
-        policy=InitialStatePolicy(1, horizon, 0, start_at),
-        theta=jnp.array([numbers.center]),
-        sigma=numbers.sigma,
-        start=initial_state(scene),
-        final_cost=lambda state: state.qpos[0],
-        contact_pair=None,
-    )
+    text, horizon, cost = mjcf(numbers, timestep), numbers.steps(timestep), lambda state: state.qpos[0]
+    return task_of_start("slide", text, horizon, start_at, numbers.center, numbers.sigma, cost)
 
 
 def trained(task: Task, iterations: int, samples: int = 64, rate: float = 0.003) -> Task:

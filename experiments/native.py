@@ -4,7 +4,8 @@
     python -m experiments.native --page      # only the page
 
 Rates are those of the fastest of several calls, with the inputs on the device. Building is the time to the first
-result of a process with empty caches, tracing included. A route that takes longer than `MOST_SECONDS` counts as such.
+result of a process with empty caches, tracing included. What takes a route longer than `MOST_SECONDS` is
+left out.
 """
 
 import argparse
@@ -15,6 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 import jax
@@ -22,6 +25,7 @@ import numpy as np
 
 from experiments import DATA, DOCS
 from experiments.pages import write_tables
+from experiments.timing import interleaved
 from mjx_study.graph.native import SWITCH
 from mjx_study.graph.scans import with_native_scans
 from mjx_study.objective import SamplePrograms
@@ -39,29 +43,28 @@ MOST_SECONDS: Final = 300
 REPEATS: Final = 7
 
 
-def measured(name: str) -> dict[str, Any]:
-    """Measure a task by the route of this process: by kind, million steps per second and the time to a result [s]."""
+def measure(name: str) -> None:
+    """Measure a task by the route of this process: print, by kind, million steps per second and seconds to a result."""
     configure()
     task, platform = make_task(name), jax.default_backend()
     contact = family_model("mujoco_default", task.scene, effective_mass=task.effective_mass)
-    size, found = SAMPLES[platform], {}
+    size, found = SAMPLES[platform], dict[str, Any]()
     keys = jax.random.key_data(jax.random.split(jax.random.key(0), size))
     arguments = jax.device_put((task.theta, contact, np.asarray(task.sigma), keys, np.ones(size)))
     for kind in KINDS:
         begun = time.perf_counter()
-        each = SamplePrograms(task.replace(onset="linear" if kind == "corrected" else "none")).by_name[
-            "value" if kind == "value" else "gradient"
-        ]
+        each = SamplePrograms(task).by_name[kind]
         program = jax.jit(jax.vmap(with_native_scans(each), (None, None, None, 0, 0)))
-        jax.block_until_ready(program(*arguments))
-        built, best = time.perf_counter() - begun, math.inf
-        for _ in range(REPEATS):
-            begun = time.perf_counter()
-            jax.block_until_ready(program(*arguments))
-            best = min(best, time.perf_counter() - begun)
+        call = partial(_finished, program, arguments)
+        call()
+        built = time.perf_counter() - begun
+        best = min(interleaved({kind: call}, REPEATS)[kind])
         found[kind] = {"rate": size * task.horizon / best / 1e6, "built": built}
-        print(json.dumps(found), flush=True)
-    return found
+        print(json.dumps({"platform": platform, "found": found}), flush=True)
+
+
+def _finished(program: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    jax.block_until_ready(program(*arguments))
 
 
 def main() -> None:
@@ -73,7 +76,7 @@ def main() -> None:
     parser.add_argument("--into", default=RESULTS, help="file of results")
     given = parser.parse_args()
     if given.route:
-        measured(*given.tasks)
+        measure(*given.tasks)
         return
     for name in () if given.page else given.tasks:
         for switch in "10":
@@ -87,11 +90,11 @@ def main() -> None:
                     lines = done.stdout.splitlines()
                 except subprocess.TimeoutExpired as error:
                     lines = (error.stdout or b"").decode().splitlines()
-            found = json.loads(lines[-1]) if lines else {}
-            row = {"task": name, "native": switch == "1", "platform": jax.default_backend(), "found": found}
-            with open(given.into, "a") as file:
-                file.write(json.dumps(row) + "\n")
-            print(row, flush=True)
+            if lines:  # this process leaves the accelerator to the routes'
+                row = {"task": name, "native": switch == "1"} | json.loads(lines[-1])
+                with open(given.into, "a") as file:
+                    file.write(json.dumps(row) + "\n")
+                print(row, flush=True)
     if given.into == RESULTS:
         write_page()
 

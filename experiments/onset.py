@@ -14,7 +14,6 @@ import time
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from estimators import NOISES, first_order, zeroth_order
@@ -22,6 +21,7 @@ from experiments import DOCS
 from experiments.atlas.design import task_of
 from experiments.pages import markdown_row, write_tables
 from experiments.quadruped import walk
+from experiments.starts import task_of_start
 from experiments.timing import interleaved
 from mjx_study.experiment.quadrature import Line, Means, grid, means
 from mjx_study.experiment.resolution import direction_of
@@ -31,11 +31,9 @@ from mjx_study.results.findings import ERROR_PER_STRENGTH, MOST_STRENGTH
 from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import contact_model, family_model
-from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import put_scene
+from mjx_study.simulation.dynamics import State
 from mjx_study.table import percent
 from mjx_study.tasks import make_task
-from mjx_study.tasks.policy import InitialStatePolicy
 from mjx_study.tasks.task import Task
 
 ANGLES = {"momentum_transfer": (0.3, 0.5, 0.7), "ball_wall": (0.2, 0.7, 0.9)}
@@ -138,23 +136,12 @@ def rule() -> None:
 
 def wall_task(timestep: float, ratio: float) -> Task:
     """Return a sphere that meets a wall 0.3 m ahead at 1 m/s, without gravity; its last position is the cost."""
-    scene = put_scene(mujoco.MjModel.from_xml_string(WALL.format(timestep=timestep, ratio=ratio)), "wall")
 
     def start_at(start: State, parameters: jax.Array) -> State:
         return dataclasses.replace(start, qvel=start.qvel.at[0].set(parameters[0]))
 
-    horizon = round(0.5 / timestep)
-    return Task(
-        name="wall",
-        scene=scene,
-        horizon=horizon,
-        policy=InitialStatePolicy(1, horizon, 0, start_at),
-        theta=jnp.ones(1),
-        sigma=0.1,
-        start=initial_state(scene),
-        final_cost=lambda state: state.qpos[0],
-        contact_pair=None,
-    )
+    mjcf, horizon = WALL.format(timestep=timestep, ratio=ratio), round(0.5 / timestep)
+    return task_of_start("wall", mjcf, horizon, start_at, 1.0, 0.1, lambda state: state.qpos[0])
 
 
 def wall() -> None:

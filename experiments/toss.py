@@ -12,14 +12,13 @@ from typing import Final
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 import mjx_study as study
 from experiments.pages import markdown_row
+from experiments.starts import task_of_start
 from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.simulation.scene import put_scene
 from mjx_study.table import markdown_table
 
 STIFFNESS, DAMPING, START, SPREAD, SECONDS = 50.0, 1.0, 1.0, 0.1, 2.0  # of the point: [1/s^2], [1/s], [m], [m], [s]
@@ -56,24 +55,14 @@ def point(start: np.ndarray, timestep: float, *, pulls: bool) -> tuple[np.ndarra
 
 def tossed(geom: str, onset: str) -> study.Task:
     """Return the task of an object thrown to the floor: its final sideways position by the speed of the throw."""
-    scene = put_scene(mujoco.MjModel.from_xml_string(TOSSED.format(GEOMS[geom])), geom)
 
     def start_at(start: study.State, parameters: jax.Array) -> study.State:
         qvel = start.qvel.at[1].set(DRIFT).at[2].set(parameters[0])
         return dataclasses.replace(start, qpos=start.qpos.at[2].set(HEIGHT), qvel=qvel)
 
-    return study.Task(
-        name=geom,
-        scene=scene,
-        horizon=HORIZON,
-        policy=study.InitialStatePolicy(1, HORIZON, 0, start_at),
-        theta=jnp.full(1, SPEED),
-        sigma=SIGMA,
-        start=study.initial_state(scene),
-        final_cost=lambda state: state.qpos[1],
-        contact_pair=("thrown", "floor"),
-        onset=onset,
-    )
+    mjcf, cost = TOSSED.format(GEOMS[geom]), lambda state: state.qpos[1]
+    task = task_of_start(geom, mjcf, HORIZON, start_at, SPEED, SIGMA, cost, ("thrown", "floor"))
+    return task.replace(onset=onset)
 
 
 def main() -> None:

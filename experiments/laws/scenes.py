@@ -7,13 +7,12 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 import mjx_study as study
 from experiments.quadruped import HEIGHT, MODEL
+from experiments.starts import Cost, Start, task_of_start
 from mjx_study.simulation.dynamics import State
-from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
@@ -21,8 +20,6 @@ TIMESTEP, GAP, SPREAD = 0.005, 0.05, 0.005  # [s], [m], [m]
 SPEED, RADIUS, MASS = 1.0, 0.1, 1.0  # [m/s], [m], [kg]
 CROUCH: Final = 0.05
 """Noise of a standing robot's posture [rad]."""
-Start = Callable[[State, jax.Array], State]
-Cost = Callable[[Any], jax.Array]
 PLANE: Final = """<mujoco><option timestep="{}"/><worldbody><geom name="floor" type="plane" size="20 20 1" condim="3"/>
   {}</worldbody></mujoco>"""
 THROWN: Final = """<body pos="0 0 {}"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>{}</body>"""
@@ -43,34 +40,14 @@ GEOMS: Final = {
 """The corners are spheres in place of the box's lower four."""
 
 
-def one_number(
-    name: str,
-    model: str,
-    horizon: int,
-    start: Start,
-    at: float,
-    sigma: float,
-    cost: Cost,
-    pair=("thrown", "floor"),
-) -> Task:
-    """Return a task of one number that sets the start of bodies on a plane."""
-    scene = put_scene(mujoco.MjModel.from_xml_string(PLANE.format(TIMESTEP, model)), name)
-    return study.Task(
-        name=name,
-        scene=scene,
-        horizon=horizon,
-        policy=study.InitialStatePolicy(1, horizon, 0, start),
-        theta=jnp.full(1, at),
-        sigma=sigma,
-        start=study.initial_state(scene),
-        final_cost=cost,
-        contact_pair=pair,
-    )
+def on_plane(name: str, bodies: str, *numbers: Any) -> Task:
+    """Return a task of one number that sets the start of bodies on a plane: `task_of_start` with these `numbers`."""
+    return task_of_start(name, PLANE.format(TIMESTEP, bodies), *numbers)
 
 
 def thrown(name: str, geom: str, horizon: int, start: Start, at: float, sigma: float, cost: Cost) -> Task:
     """Return a task of one number that sets the start of a ball or box above the ground."""
-    return one_number(name, THROWN.format(RADIUS, GEOMS[geom]), horizon, start, at, sigma, cost)
+    return on_plane(name, THROWN.format(RADIUS, GEOMS[geom]), horizon, start, at, sigma, cost, ("thrown", "floor"))
 
 
 def throw() -> Task:
@@ -112,7 +89,7 @@ def stack(name: str = "stack") -> Task:
         return State(rest.qpos.at[3].set(gap[0]), moving, rest.act, rest.warmstart)
 
     cost = lambda last: 100 * last.qpos[3] ** 2 + last.qpos.sum()  # noqa: E731
-    return one_number(name, model, 80, start, GAP, SPREAD, cost, ("thrown", "lower"))
+    return on_plane(name, model, 80, start, GAP, SPREAD, cost, ("thrown", "lower"))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,8 +22,8 @@ from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
-MOST_NATIVE: Final = {"cpu": 100_000, "gpu": 100_000}
-"""Maximum number of scalar operations in native code, by backend; it takes compilers half a minute to two minutes."""
+MOST_NATIVE: Final = 100_000
+"""Maximum number of scalar operations in native code; it takes compilers half a minute to two minutes."""
 
 _CAPTURED: Final[dict[Any, ScalarFunction | None]] = {}
 """Graphs, keyed by everything they depend on; None if too large."""
@@ -78,7 +78,7 @@ def _left() -> None:
 
 def most_scalars() -> int:
     """Maximum number of scalar operations here: `MOST_NATIVE`, or `MOST_SCALARS` without native code."""
-    return (MOST_SCALARS if native_identity() is None else MOST_NATIVE)[jax.default_backend()]
+    return MOST_SCALARS[jax.default_backend()] if native_identity() is None else MOST_NATIVE
 
 
 def _name(function: Callable[..., Any]) -> Any:
