@@ -194,7 +194,7 @@ def test_what_is_not_solved_natively_is_left_to_mjx(monkeypatch: pytest.MonkeyPa
     """A small budget of the solver, which native code would exceed; a traced model; by choice; beyond the limit."""
     scene = one_leg(3 if why == "budget" else 100)
     if why == "switch":
-        monkeypatch.setenv(SWITCH, "0")
+        monkeypatch.setenv(SWITCH, "xla")
     if why == "size":
         monkeypatch.setattr(scalars, "MOST_NATIVE", 5000)
     one = lambda data, model=scene.model: step(model, data).qpos  # noqa: E731

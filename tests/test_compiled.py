@@ -287,7 +287,7 @@ def test_a_trace_is_made_again_where_a_library_that_it_calls_is_missing(folder: 
 def test_traces_with_and_without_native_code_are_apart(folder: Path, monkeypatch: pytest.MonkeyPatch):
     first = evaluated(pusher())
     jax.clear_caches()
-    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setenv(SWITCH, "xla")
     np.testing.assert_allclose(evaluated(pusher()), first, rtol=1e-12)
     called = [build.libraries_in(path.read_bytes()) for path in folder.glob("*.trace")]
     assert sorted(map(bool, called)) == [False, True], called

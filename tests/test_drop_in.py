@@ -291,7 +291,7 @@ def test_what_has_no_derivative_is_refused() -> None:
 def test_the_backward_pass_does_not_run_the_solver_again(monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
     """The only loop of open end is the solver's; gradients, too, have it once. In native code, they call the solved
     step and the transpose of its derivative once each."""
-    monkeypatch.setenv(SWITCH, "1" if ending == "native[" else "0")
+    monkeypatch.setenv(SWITCH, "1" if ending == "native[" else "xla")
     model, data = device(FALLING)
 
     def last(speed):

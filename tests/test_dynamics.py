@@ -278,7 +278,7 @@ def test_without_native_code_the_derivative_is_the_same(monkeypatch: pytest.Monk
     """By the graph's matrix, which XLA computes."""
     extra = 'cone="elliptic" solver="Newton"'
     expected = sliding_jacobian(extra)(at(-0.0004))
-    monkeypatch.setenv("MJX_STUDY_NATIVE", "0")
+    monkeypatch.setenv("MJX_STUDY_NATIVE", "xla")
     scene, point = sliding(extra), jnp.asarray(at(-0.0004))
     after = lambda x: step_flat(scene, scene.model, x, jnp.zeros(3))[0]  # noqa: E731
     assert_close_by_rows(compiled(jax.jacrev(after), point)(point), expected, 1e-12)

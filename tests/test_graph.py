@@ -172,7 +172,7 @@ def _operations(function, *arguments) -> list[str]:
 
 
 def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped(monkeypatch):
-    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setenv(SWITCH, "xla")
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
     def function(x):
@@ -185,7 +185,7 @@ def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped(monkeypa
 
 
 def test_what_does_not_change_in_a_loop_is_computed_before_it(monkeypatch):
-    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setenv(SWITCH, "xla")
 
     def function(x):
         return jax.lax.while_loop(lambda y: y < 9.0, lambda y: y * jnp.cosh(x[0]) + 1, x[1])

@@ -128,7 +128,7 @@ def test_a_sweep_over_laws_resumes_to_the_same_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("most", [9, 20_000], ids=["as it is", "as a graph"])
 def test_a_timestep_may_be_a_number(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(SWITCH, "0")
+    monkeypatch.setenv(SWITCH, "xla")
     monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", most)
     advance = stepping(ball(), "kelvin_voigt", 2000.0)
     scene, model = advance.args

@@ -69,17 +69,18 @@ WHOLE = {
 
 
 def compare(function, *points, rtol=1e-12, exact=False):
-    """The function under `vmap`, native and in JAX's operations."""
+    """The function under `vmap`, in C, in NumPy and in JAX's operations."""
     with pytest.MonkeyPatch.context() as patch:
         found = []
-        for switch in ("1", "0"):
+        for switch in ("1", "0", "xla"):
             patch.setenv(SWITCH, switch)
             program = jax.jit(jax.vmap(lambda *each: unrolled(function, *each)))
-            assert ("native" in str(jax.make_jaxpr(program)(*points))) == (switch == "1")
+            assert ("native" in str(jax.make_jaxpr(program)(*points))) == (switch != "xla")
             found.append(jax.tree.leaves(program(*points)))
-    for ours, theirs in zip(*found, strict=True):
-        assert ours.dtype == theirs.dtype
-        np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=1e-300 if rtol < 1e-9 else 1e-37)
+    for *ours, theirs in zip(*found, strict=True):
+        for each in ours:
+            assert each.dtype == theirs.dtype
+            np.testing.assert_allclose(each, theirs, rtol=rtol, atol=1e-300 if rtol < 1e-9 else 1e-37)
 
 
 def test_every_operation_is_covered():
@@ -103,6 +104,9 @@ def test_operations_of_floats(name):
 @pytest.mark.parametrize("name", PAIRS)
 def test_operations_of_two_floats(name):
     x, y = (each.reshape(-1) for each in jnp.meshgrid(jnp.asarray(SPECIAL), jnp.asarray(SPECIAL)))
+    if name in ("pow", "atan2"):  # of subnormal numbers, which XLA takes for 0, NumPy has values
+        usual = ~np.isin(np.asarray([x, y]), [5e-324, -1e-310]).any(0)
+        x, y = x[usual], y[usual]
     if name == "rem":  # XLA from JAX 0.11 on gives NaN where a quotient overflows
         sizes = jnp.abs(x / y)
         x, y = x[sizes < 1e15], y[sizes < 1e15]
@@ -277,12 +281,15 @@ print(jax.jit(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
 """
 
 
-@pytest.mark.parametrize(("setting", "lines"), [({"PATH": "/nowhere"}, 1), ({SWITCH: "0"}, 0)])
-def test_without_a_compiler(setting, lines):
+@pytest.mark.parametrize(
+    ("setting", "lines", "in_xla"),
+    [({"PATH": "/nowhere"}, 1, False), ({SWITCH: "0"}, 0, False), ({SWITCH: "xla"}, 0, True)],
+)
+def test_without_a_compiler(setting, lines, in_xla):
     environment = {key: value for key, value in os.environ.items() if key != "CC"} | setting
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment)
-    assert done.stdout.splitlines()[-1] == "[2. 2. 2.]" and "native" not in done.stdout
-    assert done.stderr.count("mjx-study: no C compiler found: steps run through XLA, more slowly") == lines
+    assert done.stdout.splitlines()[-1] == "[2. 2. 2.]" and ("native" not in done.stdout) == in_xla
+    assert done.stderr.count("mjx-study: no C compiler found: steps run in NumPy, more slowly") == lines
 
 
 def test_the_compiler_from_pypi(tmp_path):

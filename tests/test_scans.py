@@ -20,6 +20,13 @@ from tests.test_graph import FUNCTIONS
 
 pytestmark = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
 
+
+@pytest.fixture(autouse=True, params=["1", "0"], ids=["C", "NumPy"])
+def end(request, monkeypatch):
+    """What computes the loops."""
+    monkeypatch.setenv(SWITCH, request.param)
+
+
 DRAW = np.random.default_rng(0)
 ROWS = DRAW.normal(size=(21, 5, 3))
 STARTS = DRAW.normal(size=(21, 3))
@@ -183,35 +190,43 @@ def test_steps_of_a_loop_that_stays_are_native(monkeypatch):
 def batch_of(task, monkeypatch, names, samples=11):
     contact, keys = single_contact(task)[0].contact, jax.random.split(jax.random.key(0), samples)
     given = task.theta, contact, task.sigma, np.asarray(jax.random.key_data(keys)), np.ones(samples)
-    for switch in "10":
+    for switch in ("xla", "1", "0"):
         monkeypatch.setenv(SWITCH, switch)
         simulator = Simulator(task, chunk_size=samples)
         yield [jax.tree.leaves(simulator.run(name, *given)) for name in names]
 
 
 def agree(task, monkeypatch, names, tolerance=1e-11):
-    for name, ours, theirs in zip(names, *batch_of(task, monkeypatch, names), strict=True):
-        for one, other in zip(ours, theirs, strict=True):
-            np.testing.assert_allclose(
-                one, other, rtol=0, atol=tolerance * np.max(np.abs(np.nan_to_num(other)), initial=1e-3), err_msg=name
-            )
+    for name, theirs, *ours in zip(names, *batch_of(task, monkeypatch, names), strict=True):
+        for other, *each in zip(theirs, *ours, strict=True):
+            for one in each:
+                np.testing.assert_allclose(
+                    one,
+                    other,
+                    rtol=0,
+                    atol=tolerance * np.max(np.abs(np.nan_to_num(other)), initial=1e-3),
+                    err_msg=name,
+                )
 
 
 @pytest.mark.parametrize(
     "name",
     ["pusher", *(pytest.param(each, marks=pytest.mark.slow) for each in sorted({*TASK_DESCRIPTIONS} - {"pusher"}))],
 )
+@pytest.mark.parametrize("end", ["1"], indirect=True)
 def test_batches_of_tasks(monkeypatch, name):
     agree(make_task(name, horizon=12), monkeypatch, ["value", "gradient", "steps"])
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("end", ["1"], indirect=True)
 def test_other_programs(monkeypatch):
     names = list(SamplePrograms(make_task("ball_wall")).by_name)
     agree(make_task("ball_wall", horizon=30), monkeypatch, names)
     agree(make_task("sliding_box", horizon=12, adjoint="tape"), monkeypatch, ["value", "gradient"])
 
 
+@pytest.mark.parametrize("end", ["1"], indirect=True)
 def test_networks_and_their_libraries(monkeypatch):
     """Rollouts with a network are one library beside that of the noise; a wide network stays with XLA."""
     task = with_network(make_task("pusher", horizon=12), (8, 8), jax.random.key(1))

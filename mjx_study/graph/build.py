@@ -24,7 +24,7 @@ import jax.ffi
 
 from mjx_study.caches import read_cached, write_cached
 from mjx_study.disk import temporary_folder
-from mjx_study.graph import cuda
+from mjx_study.graph import cuda, numpy_code
 from mjx_study.runtime import available_cores, libraries_folder, processor
 from mjx_study.version import version_of
 from mjx_study.watchdog import elsewhere
@@ -40,6 +40,8 @@ QUICKLY: Final = "-O1", "-fschedule-insns2"
 WELL: Final = ("-O2",)
 MOST_SECONDS: Final = 600
 """Maximum time for a compiler to run [s]."""
+PYTHON: Final = numpy_code.BEGINNING
+"""Beginning of the sources that NumPy runs."""
 PREFIX: Final = "mjx_study_"
 """Beginning of the names of libraries, which are those of their XLA targets."""
 
@@ -58,15 +60,17 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
         if shutil.which(words[0]) and (found := _run(*words, "--version")).returncode == 0:
             return tuple(words), found.stdout
     print(
-        "mjx-study: no C compiler found: steps run through XLA, more slowly; the extra `compiler` brings one",
+        "mjx-study: no C compiler found: steps run in NumPy, more slowly; the extra `compiler` brings one",
         file=sys.stderr,
     )
     return None
 
 
 @functools.cache
-def build_identity() -> str:
-    """Digest of what libraries depend on besides their source."""
+def build_identity(in_numpy: bool = False) -> str:
+    """Digest of what libraries, or sources that NumPy runs, depend on besides their source."""
+    if in_numpy:
+        return _digest(sys.version, version_of("numpy"), version_of("jaxlib"))
     return _digest(compiler(), QUICKLY, WELL, _FLAGS_HERE, processor(), cuda.target(), version_of("jaxlib"))
 
 
@@ -79,7 +83,7 @@ def _digest(*parts: Any) -> str:
 
 def build_library(source: str) -> str:
     """Begin to build a library in the background, unless it is known, and return its name."""
-    name = PREFIX + _digest(source, build_identity())
+    name = PREFIX + _digest(source, build_identity(source.startswith(PYTHON)))
     with _LOCK:
         if name not in _BUILT:
             _BUILT[name] = future = Future()
@@ -121,6 +125,8 @@ def _finish(name: str, source: str, future: Future[Any]) -> None:
 
 
 def _build(name: str, source: str) -> Any:
+    if source.startswith(PYTHON):
+        return _kept(name, source.encode())
     with temporary_folder() as folder:
         written, library = Path(folder, f"{name}.c"), Path(folder, f"{name}.so")
         written.write_text(source)
@@ -137,6 +143,11 @@ def _build(name: str, source: str) -> Any:
         if done.returncode:
             return _failed(written, shlex.join(command), done.stderr)
         content = library.read_bytes()
+    return _kept(name, content)
+
+
+def _kept(name: str, content: bytes) -> Any:
+    """Load a library, and keep it in the cache."""
     if (at := libraries_folder()) is not None:
         write_cached(at / name, content)
     return _loaded(name, content)
@@ -164,6 +175,10 @@ def _cached(name: str) -> Any:
 
 def _loaded(name: str, content: bytes) -> Any:
     """Load a library, register its handler with XLA, and return it; None if that fails."""
+    if content.startswith(PYTHON.encode()):
+        library = numpy_code.Library(content.decode())
+        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="cpu")
+        return library
     with temporary_folder() as folder:  # the file whose digest was checked, whatever becomes of the one in the cache
         path = Path(folder, f"{name}.so")
         path.write_bytes(content)

@@ -21,9 +21,7 @@ from mjx_study.graph.parts import Loop, Statement, in_parts
 _OPERATORS: Final = {
     **{"add": "+", "add_any": "+", "sub": "-", "mul": "*", "and": "&", "or": "|", "xor": "^"},
 }
-_COMPARISONS: Final = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
-_OF_MASKS: Final = {"lt": ">", "le": ">=", "gt": "<", "ge": "<=", "eq": "==", "ne": "!="}
-"""Comparisons of booleans; as an integer, a true one is -1."""
+COMPARISONS: Final = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 _FUNCTIONS: Final = frozenset(
     (
         *("abs", "acos", "asin", "atan", "atan2", "ceil", "cos", "cosh", "erf", "exp", "expm1", "floor", "log"),
@@ -32,9 +30,7 @@ _FUNCTIONS: Final = frozenset(
 )
 """Operations that the prelude has as functions, by type."""
 _TYPES: Final = (*("float64", "float32", "int64", "int32", "int16", "int8", "uint64", "uint32", "uint16", "uint8"),)
-_NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for name in _TYPES} | {
-    np.dtype(bool): "mask"
-}
+NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for name in _TYPES} | {np.dtype(bool): "mask"}
 
 
 MAX_ARGUMENT: Final = 4000
@@ -58,12 +54,9 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
     Raises:
         NotWrittenError: an operation or a type is not covered.
     """
-    writer = _Writer(function)
-    statements = writer.statements() if passes is None else writer.loop(passes)
+    writer = Writer(function)
+    statements, forms_in, forms_out = writer.written(passes)
     functions, num_kept = in_parts(statements, writer.loads, MOST_TOGETHER[platform])
-    types, avals = (function.types, function.avals) if passes is None else passes.avals(function)
-    forms_in = [(math.prod(each.shape), each.dtype, each.ndim) for each in types]
-    forms_out = [(math.prod(each.shape), each.dtype, each.ndim) for each in avals]
     if platform == "gpu":
         kernel = [_text("prelude.cu"), _text("functions.c"), *functions, _text("kernel.cu")]
         parts = ["#ifdef __CUDACC_RTC__", *kernel, "#else", _text("launcher.c"), "#endif"]
@@ -74,7 +67,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
             f"#define WIDE {int(wide)}",
             f"#define INPUTS {_forms(forms_in)}",
             f"#define OUTPUTS {_forms(forms_out)}",
-            f"#define BYTES {sum(size * np.dtype(dtype).itemsize for size, dtype, _ in forms_in + forms_out)}",
+            f"#define BYTES {sum(size * np.dtype(dtype).itemsize for size, dtype, _ in (*forms_in, *forms_out))}",
             f"#define KEPT {num_kept}",
             _text("prelude.c"),
             _text("functions.c"),
@@ -116,7 +109,7 @@ def _forms(arrays: Forms) -> str:
 
 
 def _type(dtype: Any) -> str:
-    name = _NAMES.get(np.dtype(dtype))
+    name = NAMES.get(np.dtype(dtype))
     if name is None:
         raise NotWrittenError(f"values of type {dtype}")
     return name
@@ -135,8 +128,11 @@ def _constant(value: Any) -> str:
 
 
 @no_type_check
-class _Writer:
+class Writer:
     """Statements that compute a function; the variable of a node has its number."""
+
+    of_masks = {"lt": ">", "le": ">=", "gt": "<", "ge": "<=", "eq": "==", "ne": "!="}
+    """Comparisons of booleans; as an integer, a true one is -1."""
 
     def __init__(self, function: ScalarFunction):
         self._function = function
@@ -149,14 +145,21 @@ class _Writer:
         self._uses: set[int] = set()
         self._before: list[str] = []
 
-    def statements(self) -> list[Statement | Loop]:
+    def written(self, passes: Passes | None) -> tuple[list[Statement | Loop], Forms, Forms]:
+        """All statements, and the forms of the inputs and outputs of the function, or of its passes."""
+        function = self._function
+        types, avals = (function.types, function.avals) if passes is None else passes.avals(function)
+        inputs, outputs = ([(math.prod(at.shape), at.dtype, at.ndim) for at in each] for each in (types, avals))
+        return self._statements() if passes is None else self._loop_of(passes), inputs, outputs
+
+    def _statements(self) -> list[Statement | Loop]:
         """All statements, with every output stored as soon as it is known."""
         self.loads = self._loaded(range(len(self._function.inputs)))
         constant = self._stores_of(range(len(self._function.outputs)), self._function.outputs)
         known = [self._stored(number, number) for number in self.loads]
         return [*itertools.chain(*known), *self._written(self._order), *constant]
 
-    def loop(self, passes: Passes) -> list[Statement | Loop]:
+    def _loop_of(self, passes: Passes) -> list[Statement | Loop]:
         """All statements of a loop with the function as its body; what is the same in all passes comes before it."""
         function, (first, second) = self._function, (passes.num_consts, passes.num_consts + passes.num_carry)
         carried = entries_of(function.inputs[first:second])
@@ -288,8 +291,8 @@ class _Writer:
         (first, *others), kind, parameters = values, _type(node.dtype), node.parameters or {}
         of = node.arguments[0].dtype
         match name:
-            case _ if name in _COMPARISONS:
-                signs = _OF_MASKS if _type(of) == "mask" else _COMPARISONS
+            case _ if name in COMPARISONS:
+                signs = self.of_masks if _type(of) == "mask" else COMPARISONS
                 return f"MASK({first} {signs[name]} {others[0]})"
             case "max" | "min" if kind == "mask":
                 return f"{first} {'|' if name == 'max' else '&'} {others[0]}"

@@ -19,10 +19,11 @@ from mjx_study.graph import cuda
 from mjx_study.graph.build import build_identity, build_library, compiler, known_libraries, library_ready
 from mjx_study.graph.c import NotWrittenError, source_of
 from mjx_study.graph.evaluation import written_out
-from mjx_study.graph.function import ScalarFunction, capture
+from mjx_study.graph.function import Passes, ScalarFunction, capture
+from mjx_study.graph.numpy_code import python_source
 
 SWITCH: Final = "MJX_STUDY_NATIVE"
-"""Environment variable; 0 does without native code."""
+"""Environment variable: 0 does without native code, which NumPy stands in for; xla without either."""
 _LEFT: Final[Counter[str]] = Counter()
 """Numbers of functions left to XLA, by reason."""
 POSTPONED: Final[ContextVar[bool]] = ContextVar("postponed", default=False)
@@ -30,13 +31,30 @@ POSTPONED: Final[ContextVar[bool]] = ContextVar("postponed", default=False)
 
 
 def native_identity() -> str | None:
-    """Digest of what native code depends on besides its source: processor, compiler and flags.
+    """Digest of what native code depends on besides its source: processor, compiler and flags, or NumPy's version.
 
-    None if there is to be none: with `SWITCH`, on accelerators other than NVIDIA's, and without compilers that work.
+    None if there is to be none: with `SWITCH`, on accelerators other than NVIDIA's, and there without compilers that
+    work.
     """
+    if in_numpy():
+        return build_identity(True)
     served = jax.default_backend() == "cpu" or cuda.target() is not None
-    wanted = os.environ.get(SWITCH) != "0" and served
-    return build_identity() if wanted and compiler() is not None and _works() else None
+    return build_identity() if os.environ.get(SWITCH, "") not in ("0", "xla") and served and _compiles() else None
+
+
+def in_numpy() -> bool:
+    """Whether NumPy stands in for native code: on CPUs, with `SWITCH`, and without a compiler that works."""
+    switch = os.environ.get(SWITCH, "")
+    return switch != "xla" and jax.default_backend() == "cpu" and (switch == "0" or not _compiles())
+
+
+def written(function: ScalarFunction, passes: Passes | None = None) -> str:
+    """Source of a function, or of all passes of a loop whose body it is, for what computes here.
+
+    Raises:
+        NotWrittenError: an operation or a type is not covered.
+    """
+    return python_source(function, passes) if in_numpy() else source_of(function, jax.default_backend(), passes)
 
 
 def native_summary() -> str:
@@ -51,8 +69,10 @@ def count_left(reason: str) -> None:
 
 
 @cache
-def _works() -> bool:
-    """Whether the smallest of functions can be built."""
+def _compiles() -> bool:
+    """Whether there is a compiler, and builds the smallest of functions."""
+    if compiler() is None:
+        return False
     function = capture(lambda x: x + 1, jax.ShapeDtypeStruct((), np.float32), most=9)
     return library_ready(build_library(source_of(function, jax.default_backend())))
 
@@ -66,7 +86,7 @@ def as_native(values: ScalarFunction, function: ScalarFunction, *, early: bool =
         early: whether to begin to build it now, or when a program with it is compiled.
     """
     native = NativeFunction(
-        lambda: source_of(values, native.platform),
+        lambda: written(values),
         function.types,
         function.avals,
         lambda: written_out(function),

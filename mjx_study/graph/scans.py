@@ -17,9 +17,9 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.interpreters.partial_eval import dce_jaxpr
 
-from mjx_study.graph.c import NotWrittenError, source_of
+from mjx_study.graph.c import NotWrittenError
 from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, run, scan_inputs
-from mjx_study.graph.native import POSTPONED, NativeFunction, count_left, native_identity, switched_on
+from mjx_study.graph.native import POSTPONED, NativeFunction, count_left, native_identity, switched_on, written
 from mjx_study.graph.nodes import ScalarGraph, TooLargeError, constants
 from mjx_study.graph.scalars import most_scalars
 
@@ -129,7 +129,7 @@ def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
             length=parameters["length"],
             reverse=parameters["reverse"],
         )
-        source = source_of(function, jax.default_backend(), passes)
+        source = written(function, passes)
     except NotWrittenError as error:
         count_left(f"loop with {error}")
         return None

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_study.compiled import Compiled
+from mjx_study.graph.native import in_numpy
 from mjx_study.tasks.task import Task
 from mjx_study.watchdog import awaited
 
@@ -19,6 +20,8 @@ CPU_CHUNKS: Final = (11, 101, 201)
 programs; one more than round numbers, for the baseline."""
 MANY: Final = 2000
 """Samples from which a CPU takes the largest chunks, which pay for another program."""
+IN_NUMPY: Final = 1001
+"""Samples per call where NumPy stands in for native code: an operation takes 0.3 us for 100 samples, 0.4 for 1,000."""
 MAX_CHUNK: Final = {"cpu": CPU_CHUNKS[-1], "gpu": 2**17 + 1, "tpu": 2**17 + 1}
 """Maximum number of samples per device and call, by backend."""
 MAX_SHARE: Final = 0.25
@@ -71,12 +74,15 @@ def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), 
     """Choose the chunk size for `samples` and their baseline.
 
     On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the middle one for up to `MANY`; for a program of so many
-    samples alone, all that the largest holds. On accelerators, the size that needs the fewest calls (at least one per
-    device), evenly filled, with at most as many samples as task gradients fit into `MAX_SHARE` of the memory.
+    samples alone, all that the largest holds; `IN_NUMPY` for half of the middle one or more. On accelerators, the size
+    that needs the fewest calls (at least one per device), evenly filled, with at most as many samples as task gradients
+    fit into `MAX_SHARE` of the memory.
     """
     platform = devices[0].platform
     if platform == "cpu":
         few, some, most = CPU_CHUNKS
+        if in_numpy() and samples > some // 2:
+            return IN_NUMPY
         if own_program:
             return min(samples + 1, most)
         return few if samples < few else some if samples < MANY else most
@@ -84,6 +90,11 @@ def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), 
     memory = (devices[0].memory_stats() or {}).get("bytes_limit", math.inf)
     most = max(1, int(min(MAX_CHUNK[platform], MAX_SHARE * memory / max(map(_gradient_bytes, tasks), default=1))))
     return math.ceil(each / math.ceil(each / most))
+
+
+def used_share(samples: int, chunk: int) -> float:
+    """Share of the rows of chunks that are not padding."""
+    return samples / (math.ceil(samples / chunk) * chunk)
 
 
 def _gradient_bytes(task: Task) -> int:
