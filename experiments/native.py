@@ -1,4 +1,4 @@
-"""Table of docs/native.md: tasks as native code and through XLA, on this machine.
+"""Tables of docs/native.md: tasks as native code, in NumPy and through XLA, on this machine.
 
     python -m experiments.native TASK ...    # all of `TASKS` without names; each route in a process of its own
     python -m experiments.native --page      # only the page
@@ -26,7 +26,7 @@ import numpy as np
 from experiments import DATA, DOCS
 from experiments.pages import write_tables
 from experiments.timing import interleaved
-from mjx_study.graph.native import SWITCH
+from mjx_study.graph.native import SWITCH, in_numpy
 from mjx_study.graph.scans import with_native_scans
 from mjx_study.objective import SamplePrograms
 from mjx_study.runtime import configure
@@ -38,6 +38,8 @@ RESULTS: Final = DATA / "native.jsonl"
 TASKS: Final = ("pusher", "sliding_box", "ball_wall", "momentum_transfer", "tennis", "gripper", "landing")
 KINDS: Final = {"value": "rollouts", "gradient": "gradients", "corrected": "corrected gradients"}
 SAMPLES: Final = {"cpu": 1000, "gpu": 98_304}
+ROUTES: Final = {"native": "1", "NumPy": "0", "XLA": "xla"}
+"""Settings of `SWITCH`."""
 MOST_SECONDS: Final = 300
 """Maximum time for a route."""
 REPEATS: Final = 7
@@ -46,6 +48,8 @@ REPEATS: Final = 7
 def measure(name: str) -> None:
     """Measure a task by the route of this process: print, by kind, million steps per second and seconds to a result."""
     configure()
+    if os.environ.get(SWITCH) == ROUTES["NumPy"] and not in_numpy():
+        return
     task, platform = make_task(name), jax.default_backend()
     contact = family_model("mujoco_default", task.scene, effective_mass=task.effective_mass)
     size, found = SAMPLES[platform], dict[str, Any]()
@@ -79,7 +83,7 @@ def main() -> None:
         measure(*given.tasks)
         return
     for name in () if given.page else given.tasks:
-        for switch in "10":
+        for route, switch in ROUTES.items():
             with tempfile.TemporaryDirectory() as folder:
                 environment = os.environ | {SWITCH: switch, "XDG_CACHE_HOME": folder}
                 command = [sys.executable, "-m", "experiments.native", "--route", name]
@@ -91,7 +95,7 @@ def main() -> None:
                 except subprocess.TimeoutExpired as error:
                     lines = (error.stdout or b"").decode().splitlines()
             if lines:  # this process leaves the accelerator to the routes'
-                row = {"task": name, "native": switch == "1"} | json.loads(lines[-1])
+                row = {"task": name, "route": route} | json.loads(lines[-1])
                 with open(given.into, "a") as file:
                     file.write(json.dumps(row) + "\n")
                 print(row, flush=True)
@@ -101,22 +105,22 @@ def main() -> None:
 
 def write_page() -> None:
     """Write the tables of docs/native.md, from the last measurement of each task, route and platform."""
-    rows = {(each["platform"], each["task"], each["native"]): each["found"] for each in map(json.loads, open(RESULTS))}
+    rows = {(each["platform"], each["task"], each["route"]): each["found"] for each in map(json.loads, open(RESULTS))}
     tables = {}
-    for platform in SAMPLES:
+    for platform, route in (("cpu", "native"), ("gpu", "native"), ("cpu", "NumPy")):
         lines = []
-        for name in dict.fromkeys(task for where, task, _ in rows if where == platform):
-            ours, theirs = (rows.get((platform, name, native), {}) for native in (True, False))
+        for name in dict.fromkeys(task for where, task, how in rows if (where, how) == (platform, route)):
+            ours, theirs = (rows.get((platform, name, each), {}) for each in (route, "XLA"))
             cells = [f"`{name}`"]
             for kind in KINDS:
-                native, other = (each[kind]["rate"] if kind in each else math.nan for each in (ours, theirs))
-                cells.append(" / ".join(map(_number, (native, other))) + f" = {native / other:.1f}")
+                own, other = (each[kind]["rate"] if kind in each else math.nan for each in (ours, theirs))
+                cells.append(" / ".join(map(_number, (own, other))) + f" = {own / other:.1f}")
             whole = (
                 sum(each[kind]["built"] for kind in KINDS) if len(each) == 3 else math.nan for each in (ours, theirs)
             )
             lines.append([*cells, " / ".join(map(_number, whole))])
         header = ["task", *KINDS.values(), "building [s]"]
-        tables[f"native, {platform}"] = markdown_table(lines, header).replace(" / - = nan", "").replace(" / -", "")
+        tables[f"{route}, {platform}"] = markdown_table(lines, header).replace(" / - = nan", "").replace(" / -", "")
     write_tables(DOCS / "native.md", tables)
 
 

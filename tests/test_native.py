@@ -19,7 +19,7 @@ from mjx_study import runtime
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.graph import build, c, native, random
 from mjx_study.graph.function import capture
-from mjx_study.graph.native import SWITCH, native_identity
+from mjx_study.graph.native import SWITCH, computes_steps, native_identity
 from mjx_study.graph.nodes import ELEMENTWISE
 from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation.dynamics import initial_state, step
@@ -74,6 +74,7 @@ def compare(function, *points, rtol=1e-12, exact=False):
         found = []
         for switch in ("1", "0", "xla"):
             patch.setenv(SWITCH, switch)
+            assert computes_steps() == {"1": "native", "0": "NumPy", "xla": "XLA"}[switch]
             program = jax.jit(jax.vmap(lambda *each: unrolled(function, *each)))
             assert ("native" in str(jax.make_jaxpr(program)(*points))) == (switch != "xla")
             found.append(jax.tree.leaves(program(*points)))

@@ -48,6 +48,11 @@ def in_numpy() -> bool:
     return switch != "xla" and jax.default_backend() == "cpu" and (switch == "0" or not _compiles())
 
 
+def computes_steps() -> str:
+    """What computes functions that are native code where it can be built: "native", "NumPy" or "XLA"."""
+    return "NumPy" if in_numpy() else "XLA" if native_identity() is None else "native"
+
+
 def written(function: ScalarFunction, passes: Passes | None = None) -> str:
     """Source of a function, or of all passes of a loop whose body it is, for what computes here.
 

@@ -15,6 +15,7 @@ from estimators.intervals import Interval
 from estimators.registry import ESTIMATORS, label_of
 from mjx_study.choices import KINDS
 from mjx_study.experiment.study import StudyCell, StudyPlan, estimators_of
+from mjx_study.graph.native import computes_steps
 from mjx_study.identity import git_revision, versions
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.options.files import digest_of_json
@@ -163,7 +164,7 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         "contents": plan.contents,
         "seen": plan.seen,
         "versions": versions(),
-        "environment": environment(),
+        "environment": environment() | {"steps": computes_steps()},
         "revision": git_revision(),
         "command": command,
         "described": {name: describe_estimator(each) for name, each in named},
