@@ -10,12 +10,12 @@ from experiments.atlas import design, page, run, table
 from experiments.pages import replace_tables
 from mjx_study.table import percent
 
-TABLE = table.read(run.RESULTS)
+TABLE, OF_LAWS = (table.read(run.RESULTS, laws) for laws in (False, True))
 
 
 def test_tables_of_the_page_are_those_of_the_file() -> None:
     text = page.PAGE.read_text()
-    assert replace_tables(text, page.tables(TABLE)) == text
+    assert replace_tables(text, page.tables(TABLE, OF_LAWS)) == text
     assert run.RESULTS.stat().st_size < 1.5e6
 
 
@@ -114,6 +114,72 @@ def test_the_file_holds_the_cells_of_the_design() -> None:
         cell = cells[int(row["index"])]
         for name in ("family", "stiffness", "width", "sigma", "theta"):
             assert row[name] == pytest.approx(getattr(cell, name), rel=2**-run.DIGITS)
+
+
+def test_cells_of_laws_follow_with_numbers_of_their_own() -> None:
+    """A law's cells have its four smoothings equally often, and numbers that no other family has."""
+    jobs = run.jobs(design.LAWS)
+    cells = [cell for job in jobs[::9] for cell in job.cells(design.LAWS)]
+    assert {(design.PROGRAMS[job.program][0], job.law) for job in jobs} == {
+        (task, law) for task in design.TASKS for law in design.LAWS if (task, law) not in design.REFUSED
+    }
+    assert min(cell.index for cell in cells) >= design.CELLS and len({cell.index for cell in cells}) == len(cells)
+    first = [*design.cells_of(0), *design.law_cells(0, "hunt_crossley"), *design.law_cells(0, "kelvin_voigt")]
+    assert len({cell.sigma for cell in first}) == len(first)
+    for name, kappa in (("hunt_crossley", 1e-5), ("log_barrier", 1e-3)):
+        levels = [cell.smoothing / kappa for cell in design.law_cells(0, name)]
+        assert sorted(levels)[:: len(levels) // 4] == pytest.approx([0.01, 0.1, 1, 10])
+    assert all(len({cell.smoothing for cell in block}) == 1 for block in run.blocks(jobs[0].cells(design.LAWS)))
+
+
+@pytest.mark.parametrize(("task", "law"), [("ball_wall", "conic"), ("momentum_transfer", "conic"), ("tennis", "conic")])
+def test_refused_laws_are_those_of_the_design(task: str, law: str) -> None:
+    pytest.importorskip("mujodico", reason="the extra laws is not installed")
+    program = [name for name, _ in design.PROGRAMS].index(task)
+    cell = next(design.law_cells(program, law))
+    if (task, law) in design.REFUSED:
+        with pytest.raises(ValueError, match="elliptic cones"):
+            design.contact_of(design.task_of(*design.PROGRAMS[program]), cell)
+        return
+    made = design.contact_of(design.task_of(*design.PROGRAMS[program]), cell)
+    assert made.law is not None and (made.law.name, made.law.smoothing) == (law, cell.smoothing)
+
+
+def test_merging_keeps_what_a_file_has_and_adds_columns(tmp_path: Path) -> None:
+    old, new = tmp_path / "old.npz", tmp_path / "new.npz"
+    for path, made, columns in (
+        (old, ["here"], {"index": [0.0, 1.0], "slope": [1.0, 2.0]}),
+        (new, ["there", "here"], {"index": [1.0, 7.0], "slope": [3.0, 4.0], "smoothing": [0.5, 0.25]}),
+    ):
+        arrays = {name: np.array(each) for name, each in columns.items()} | {"environment": np.zeros(2)}
+        run.write(path, [arrays], about=run.described(made))
+    run.merge(new, old)
+    found = run.read(old)
+    np.testing.assert_array_equal(found["index"], [0, 1, 7])
+    np.testing.assert_array_equal(found["slope"], [1, 3, 4])
+    np.testing.assert_array_equal(found["smoothing"], [np.nan, 0.5, 0.25])
+    assert run.about(old)["environments"] == ["here", "there"]
+    np.testing.assert_array_equal(found["environment"], [0, 1, 1])
+
+
+def planted_laws() -> table.Table:
+    """Cells of `conic` on the pusher: right, and less noisy than zeroth order, but for a quarter, at kappa / 10."""
+    rows = 40
+    off = np.arange(rows) % 4 == 0
+    cells = TABLE[(TABLE.task == "pusher")].head(rows).assign(contact="conic", meets=True, stable=1.0)
+    cells = cells.assign(fobg_off=off.astype(float), above=off.astype(float), ratio=np.where(off, 4.0, 0.5))
+    return cells.assign(smoothing=np.where(off, 1e-6, 1e-5))
+
+
+def test_tables_of_laws_count_planted_verdicts() -> None:
+    laws = planted_laws()
+    found = page.tables(TABLE, laws)
+    (row,) = (line for line in found["laws_off"].splitlines() if "`conic`" in line)
+    assert [each.strip() for each in row.split("|")[2:-1]] == ["-", "refused", "25 (14-40; 40)", "-", "refused", "-"]
+    (row,) = (line for line in found["laws_variance"].splitlines() if "`conic`" in line)
+    assert "| 0.5 (25 %; 40) |" in row
+    (row,) = (line for line in found["laws_smoothing"].splitlines() if "`conic`" in line)
+    assert row.endswith("| - | 100 (72-100; 10) | 0 (0-11; 30) | - | - | 4 (100 %; 10) | 0.5 (0 %; 30) | - |")
 
 
 def test_parts_are_joined_without_duplicate_cells(tmp_path: Path) -> None:

@@ -10,12 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments.claims import merged
 from mjx_study import cli
-from mjx_study.claims import CLAIMS, NUM_VERDICTS
+from mjx_study.choices import laws_of
+from mjx_study.claims import CLAIMS, NUM_VERDICTS, ledger
 from mjx_study.claims.claim import Claim, Criterion, above, below
 from mjx_study.claims.laboratory import EFFORTS, FAMILIES, Laboratory, Statistic, exact, mean_of, ratio_of, share_of
 from mjx_study.claims.ledger import deciding_size, interval_of, measure_ledger
-from mjx_study.claims.page import markdown, matrix_lines
+from mjx_study.claims.page import markdown, matrix_lines, verdict_counts
+from mjx_study.claims.theory import relative_bias
+from mjx_study.simulation import law
 
 ROOT = Path(__file__).parents[1]
 FULL, QUICK = (ROOT / "experiments" / "data" / f"{name}.json" for name in ("claims", "claims_quick"))
@@ -97,6 +101,60 @@ def test_a_wrong_estimator_is_seen() -> None:
     for measure, verdict in ((claim.measure, "holds"), (off, "fails")):
         document = measure_ledger([dataclasses.replace(claim, measure=measure)], "quick", verdicts=NUM_VERDICTS)
         assert document["claims"][0]["evidence"][0]["verdict"] == verdict
+
+
+def test_claims_on_laws_are_counted_without_their_extra(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(law, "installed", lambda: False)
+    monkeypatch.setattr(ledger, "installed", lambda: False)
+    chosen = [CLAIMS["lemma-closed-form"], CLAIMS["laws-unbiased"]]
+    document = measure_ledger(chosen, "quick", verdicts=NUM_VERDICTS)
+    assert [claim["id"] for claim in document["claims"]] == ["lemma-closed-form"]
+    assert document["not_checked"] == len(chosen[1].cases)
+    assert verdict_counts(document).endswith(f"; not checked: {len(chosen[1].cases)}, which need mjx-study[laws]")
+    assert cli.main(["claims", "--only", "laws-unbiased"]) == 2
+    assert "laws-unbiased needs MuJoDiCo: pip install 'mjx-study[laws]'" in capsys.readouterr().err
+
+
+def test_claims_on_laws_have_no_sampling_error() -> None:
+    """The level of the others' intervals depends on it."""
+    of_laws = [each for name, each in (*evidence_of(FULL), *evidence_of(QUICK)) if CLAIMS[name].of_laws]
+    assert {each["of"] for each in of_laws} == {"points"}
+    assert {each["family"] for each in of_laws} == set(laws_of(FAMILIES))
+
+
+def test_the_bias_of_a_law_is_that_of_its_own_smoothing_and_of_what_touches() -> None:
+    """A ball through a cone is right where MuJoCo's default is not; a box through the cone is wrong."""
+    pytest.importorskip("mujodico", reason="the extra laws is not installed")
+    lab = Laboratory(dataclasses.replace(EFFORTS["quick"], density=10))
+    bias = {
+        (system, family): relative_bias(lab, f"{system}, 0.05 m", family).estimate
+        for system, family in (("throw", "conic"), ("throw", "mujoco_default"), ("box", "conic"))
+    }
+    assert abs(bias["throw", "conic"]) < 0.01 and bias["throw", "mujoco_default"] < -0.5 and bias["box", "conic"] < -0.5
+    moved, usual = (lab.slopes("throw", "log_barrier", 0.05, stiffness=1e4, smoothing=each) for each in (10.0, 1.0))
+    assert abs(moved.gradient / usual.gradient - 1) > 0.5 and abs(moved.relative) < 0.01
+
+
+def test_merged_claims_replace_their_like() -> None:
+    stored = json.loads(QUICK.read_text())
+    name = stored["claims"][3]["id"]
+    changed = stored["claims"][3] | {"evidence": [], "revision": "new"}
+    found = stored | {"claims": [changed]}
+    after = merged(stored, found)
+    assert [claim["id"] for claim in after["claims"]] == list(CLAIMS)
+    assert {claim["id"] for claim in after["claims"] if claim not in stored["claims"]} == {name}
+    assert "new" in after["revisions"]
+    for other, message in (
+        ({"level": 0.9}, "another level"),
+        ({"effort": {"name": "full"}}, "another effort"),
+        ({"environment": {"versions": {"jax": "0"}}}, "other versions"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            merged(stored, found | other)
+    with pytest.raises(ValueError, match=f"never measured: {name}$"):
+        merged(stored | {"claims": stored["claims"][:3] + stored["claims"][4:]}, found | {"claims": []})
 
 
 def test_a_stopped_run_resumes_and_changed_claims_are_measured_again(tmp_path: Path) -> None:

@@ -67,7 +67,10 @@ def test_a_scene_that_an_engine_lacks_is_a_dash_with_a_reason() -> None:
     lacking = {"error": "knows no walls"}
     assert combined([lacking, None]) == "-"
     said = tables({("jaxsim", "wall", 0.005): lacking}, {})
-    assert f"| {catalog.ENGINES['jaxsim'].label} | wall | knows no walls |" in said["reasons"]
+    label = catalog.ENGINES["jaxsim"].label
+    assert f"| {label} | wall at 5 ms | knows no walls |" in said["reasons"]
+    (others,) = (line for line in said["reasons"].splitlines() if line.startswith(f"| {label} | toss,"))
+    assert "wall at 2 ms" in others and others.endswith("| not run |")
     assert "JaxSim" not in said["wall"]
 
 

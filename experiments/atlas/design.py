@@ -1,10 +1,12 @@
 """The design of the atlas: which tasks, timesteps, contact models, noises and thetas its cells have.
 
 The contact models, sigmas and thetas of each family are a scrambled Sobol sequence, so any prefix covers them evenly: a
-run that ends early gives a coarser atlas, not a partial one.
+run that ends early gives a coarser atlas, not a partial one. Contact laws other than MuJoCo's are a second block, whose
+cells follow those of the first.
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator
 from typing import Final
@@ -12,6 +14,8 @@ from typing import Final
 import numpy as np
 from scipy.stats import qmc
 
+from mjx_study.choices import FAMILIES as CONTACTS
+from mjx_study.choices import laws_of
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.dynamics import initial_state
 from mjx_study.tasks import make_task
@@ -26,8 +30,14 @@ POINTS: Final = 128
 DAMPRATIO: Final = (0.1, 2.0)
 WIDTH: Final = (3e-4, 3e-2)
 """Depths over which the impedance of `smooth_onset` rises [m]."""
+OWN_WIDTH: Final = 0.001
+"""That of the others [m]."""
 NOISE: Final = (0.1, 3.0)
 """Factors on the task's sigma."""
+LAWS: Final = tuple(laws_of(CONTACTS))
+"""Families with a contact law other than MuJoCo's, which the extra `laws` has."""
+SMOOTHING: Final = (0.01, 0.1, 1.0, 10.0)
+"""Factors on a law's default smoothing; each has its own compiled programs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +70,10 @@ GAP: Final = 0.1
 """Gap of `pusher_apart` at the start [m]."""
 PROGRAMS: Final = tuple((name, timestep) for name, setting in TASKS.items() for timestep in setting.timesteps)
 CELLS: Final = len(PROGRAMS) * POINTS * len(FAMILIES)
-COLUMNS: Final = ("program", "family", "stiffness", "dampratio", "width", "sigma", "theta")
+"""Cells under MuJoCo's law; indices of the laws' cells start here."""
+REFUSED: Final = frozenset(itertools.product(("ball_wall", "sliding_box"), ("log_barrier", "conic")))
+"""Tasks with elliptic cones, which these laws do not have."""
+COLUMNS: Final = ("program", "family", "stiffness", "dampratio", "width", "smoothing", "sigma", "theta")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +82,11 @@ class Cell:
 
     Attributes:
         program: index into `PROGRAMS`.
-        family: index into `FAMILIES`.
-        stiffness: [N/m].
-        dampratio: of the contact; NaN for the task's own damping.
+        family: index into `FAMILIES + LAWS`.
+        stiffness: [N/m]; NaN for a law without one.
+        dampratio: of the contact; NaN for the task's own damping, or the law's.
         width: of the impedance's rise [m].
+        smoothing: kappa of a law other than MuJoCo's [J]; NaN for MuJoCo's.
         sigma: standard deviation of the noise.
         theta: t, of theta = t direction.
     """
@@ -83,34 +97,63 @@ class Cell:
     stiffness: float
     dampratio: float
     width: float
+    smoothing: float
     sigma: float
     theta: float
 
+    @property
+    def contact(self) -> str:
+        """Name of the contact family."""
+        return (FAMILIES + LAWS)[self.family]
+
+
+def drawn(program: int, seed: int) -> np.ndarray:
+    """Points of a scrambled Sobol sequence (points, 6): stiffness, damping ratio, width, sigma and theta at a task and
+    timestep, and the third in [0, 1) once more, for the smoothing of laws."""
+    name, timestep = PROGRAMS[program]
+    setting, sigma = TASKS[name], task_of(name, timestep).sigma
+    low, high = np.log([setting.stiffness, DAMPRATIO, WIDTH, [factor * sigma for factor in NOISE]]).T
+    unit = qmc.Sobol(5, rng=seed).random_base2(round(math.log2(POINTS)))
+    along = setting.theta[0] + (setting.theta[1] - setting.theta[0]) * unit[:, 4]
+    return np.column_stack([np.exp(low + (high - low) * unit[:, :4]), along, unit[:, 2]])
+
 
 def cells_of(program: int) -> Iterator[Cell]:
-    """Yield the cells of a task and timestep, cycling through the families."""
-    name, timestep = PROGRAMS[program]
-    setting, sigma, own = TASKS[name], task_of(name, timestep).sigma, 0.001
-    ranges = [setting.stiffness, DAMPRATIO, WIDTH, [factor * sigma for factor in NOISE]]
-    low, high = np.log(ranges).T
-    drawn = [
-        qmc.Sobol(5, rng=program * len(FAMILIES) + family).random_base2(round(math.log2(POINTS)))
-        for family in range(len(FAMILIES))
-    ]
+    """Yield the cells of a task and timestep under MuJoCo's law, cycling through the families."""
+    points = [drawn(program, program * len(FAMILIES) + family) for family in range(len(FAMILIES))]
     for point in range(POINTS):
         for family, label in enumerate(FAMILIES):
-            *unit, along = drawn[family][point]
-            stiffness, dampratio, width, noise = np.exp(low + (high - low) * unit)
+            stiffness, dampratio, width, noise, theta, _ = points[family][point]
             yield Cell(
                 (program * POINTS + point) * len(FAMILIES) + family,
                 program,
                 family,
                 stiffness,
                 math.nan if label in UNDAMPED else dampratio,
-                width if label == "smooth_onset" else own,
+                width if label == "smooth_onset" else OWN_WIDTH,
+                math.nan,
                 noise,
-                setting.theta[0] + (setting.theta[1] - setting.theta[0]) * along,
+                theta,
             )
+
+
+def law_cells(program: int, law: str) -> Iterator[Cell]:
+    """Yield the cells of a task and timestep under another law than MuJoCo's."""
+    at = program * len(LAWS) + LAWS.index(law)
+    family = CONTACTS[law]
+    points = drawn(program, len(PROGRAMS) * len(FAMILIES) + at)
+    for point, (stiffness, dampratio, _, noise, theta, level) in enumerate(points):
+        yield Cell(
+            CELLS + at * POINTS + point,
+            program,
+            len(FAMILIES) + LAWS.index(law),
+            stiffness if family.swept else math.nan,
+            dampratio if family.swept and family.dampratio else math.nan,
+            OWN_WIDTH,
+            family.smoothing * SMOOTHING[int(level * len(SMOOTHING))],
+            noise,
+            theta,
+        )
 
 
 def task_of(name: str, timestep: float) -> Task:
@@ -126,9 +169,11 @@ def task_of(name: str, timestep: float) -> Task:
 
 def contact_of(task: Task, cell: Cell) -> ContactModel:
     """Return the contact model of a cell."""
-    damping = None
+    damping, law = None, cell.contact in LAWS
     if not math.isnan(cell.dampratio):
         damping = 2 * cell.dampratio * math.sqrt(cell.stiffness * task.effective_mass)
-    (point,), _ = family_grid(task, [FAMILIES[cell.family]], [cell.stiffness], damping)
+    (point,), _ = family_grid(task, [cell.contact], [cell.stiffness], damping, cell.smoothing if law else None)
     assert point.contact is not None
+    if law:
+        return point.contact
     return dataclasses.replace(point.contact, solimp=point.contact.solimp.at[2].set(cell.width))

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from estimators.confidence import coverage_interval
+from experiments.atlas.design import LAWS
 from experiments.atlas.table import GROUPS, TOLERANCE, VERDICTS, Table, bodies_meet, plain_is_off, term_acts, verdicts
 from mjx_study.diagnose.advice import SMOOTH_SHARE
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
@@ -21,6 +22,7 @@ COLOURS: Final = {
     "mujoco_stiff": "#E69F00",
     "smooth_onset": "#009E73",
 }
+OF_LAWS: Final = dict(zip(LAWS, ("#0072B2", "#E69F00", "#009E73", "#CC79A7"), strict=True))
 TASKS: Final = {
     "momentum_transfer": "#0072B2",
     "ball_wall": "#E69F00",
@@ -31,6 +33,8 @@ TASKS: Final = {
 }
 """Colours of the tasks, in the order of panels."""
 BINS: Final = 8
+RATIOS: Final = (1e-7, 1e7)
+"""Limits of ratios of variances."""
 
 
 def binned(axes: Axes, values: Any, verdict: Any, colour: str) -> None:
@@ -81,7 +85,7 @@ def variance_figure(table: Table) -> Figure:
     """Draw the ratio of variances against the share of the stability limit, one panel per task."""
     figure, axes = panels(2, 3)
     for each, name in zip(axes, TASKS, strict=True):
-        scatter(each, table[(table.task == name) & table.ratio.notna()], "limit", "ratio", (1e-7, 1e7))
+        scatter(each, table[(table.task == name) & table.ratio.notna()], "limit", "ratio", RATIOS)
         each.axhline(1, color="black", linewidth=0.6)
         each.axvline(1, color="black", linewidth=0.6, linestyle=":")
         each.set_title(name)
@@ -164,6 +168,29 @@ def samples_figure(table: Table) -> Figure:
     axes[0].set_ylabel("variance x seconds,\nzeroth / first order")
     axes[1].set_ylabel("rollouts until\nzeroth order is ahead")
     key(figure, TASKS)
+    return figure
+
+
+def laws_figure(table: Table, laws: Table) -> Figure:
+    """Draw the decided relative bias against the ratio of variances, one panel per task: laws over MuJoCo's default
+    impedance."""
+    figure, axes = panels(2, 3)
+    parts = [
+        (table[table.contact == "mujoco"], "#BBBBBB"),
+        *((laws[laws.contact == law], OF_LAWS[law]) for law in LAWS),
+    ]
+    for each, name in zip(axes, TASKS, strict=True):
+        for part, colour in parts:
+            shown = part[bodies_meet(part) & (part.task == name) & np.isfinite(part.fobg_off)]
+            x, y = shown.ratio.clip(*RATIOS), shown.fobg_relative.clip(1e-4, 1e2)
+            each.scatter(x, y, s=4, color=colour, alpha=0.6, linewidths=0)
+        each.axhline(TOLERANCE, color="black", linewidth=0.6)
+        each.axvline(1, color="black", linewidth=0.6)
+        each.set(xscale="log", yscale="log", xlim=RATIOS, ylim=(1e-4, 1e2), title=name)
+        each.set_xlabel("variance, first / zeroth order")
+    for each in axes[:: len(axes) // 2]:
+        each.set_ylabel("relative bias of first order")
+    key(figure, {"mujoco": "#BBBBBB"} | OF_LAWS)
     return figure
 
 

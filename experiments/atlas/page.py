@@ -1,13 +1,15 @@
 """Tables and figures of docs/atlas.md."""
 
 import itertools
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
 from estimators.confidence import coverage_interval
 from experiments import DOCS
-from experiments.atlas.figures import BINS, FIGURES, TASKS
+from experiments.atlas.design import LAWS, REFUSED, SMOOTHING
+from experiments.atlas.figures import BINS, FIGURES, TASKS, laws_figure
 from experiments.atlas.run import RESULTS
 from experiments.atlas.table import (
     GROUPS,
@@ -22,6 +24,7 @@ from experiments.atlas.table import (
     verdicts,
 )
 from experiments.pages import save_figure, write_tables
+from mjx_study.choices import FAMILIES
 from mjx_study.diagnose.advice import SMOOTH_SHARE
 from mjx_study.table import markdown_table
 
@@ -30,6 +33,8 @@ OF_THE_DESIGN: Final = ("limit", "h_b", "h2_k", "impedance", "periods", "params"
 """Groups that are known without a rollout; for the others, only cells where bodies meet count."""
 STRENGTHS: Final = (0.03, 0.8)
 """Onset strengths that separate the columns of the table of bounds."""
+BESIDE: Final = ("mujoco", "smooth_onset", "penalty")
+"""Families of MuJoCo's law beside which others are listed."""
 
 
 def share(right: np.ndarray) -> str:
@@ -150,14 +155,62 @@ TABLES: Final = {
 }
 
 
-def tables(table: Table) -> dict[str, str]:
-    """Return every table of the page by its name."""
-    return {name: make(table) for name, make in TABLES.items()}
+def by_law(table: Table, laws: Table, say: Callable[[Table], str]) -> str:
+    """Format a table of laws by task."""
+    rows = []
+    for name in (*BESIDE, *LAWS):
+        of = laws if name in LAWS else table
+        cells = (of[(of.contact == name) & (of.task == task)] for task in TASKS)
+        said = ["refused" if (task, name) in REFUSED else say(each) for task, each in zip(TASKS, cells, strict=True)]
+        rows.append([f"`{name}`", *said])
+    return markdown_table(rows, ("law", *(f"`{task}`" for task in TASKS)))
+
+
+def off_of(part: Table) -> str:
+    """Format how often first order is off where bodies meet."""
+    return share(part[bodies_meet(part)].fobg_off.dropna().to_numpy() == 1)
+
+
+def ratio_of(part: Table) -> str:
+    """Format the median ratio of variances in stable cells, and how often first order's is above."""
+    stable = part[part.stable == 1]
+    above = stable.above.dropna()
+    if not len(above):
+        return "-"
+    return f"{stable.ratio.median():.1g} ({100 * above.mean():.0f} %; {len(above)})"
+
+
+def smoothing_table(laws: Table) -> str:
+    """Format both by the factor on a law's smoothing."""
+    rows = []
+    for name in LAWS:
+        part = laws[laws.contact == name]
+        level = np.argmin(np.abs(np.log(np.outer(part.smoothing, 1 / np.array(SMOOTHING)) / kappa(name))), axis=1)
+        parts = [part[level == each] for each in range(len(SMOOTHING))]
+        rows.append([f"`{name}`", f"{kappa(name):.0e}", *map(off_of, parts), *map(ratio_of, parts)])
+    factors = [f"{factor:g} kappa" for factor in SMOOTHING]
+    return markdown_table(rows, ("law", "kappa [J]", *(f"off, {each}" for each in factors), *factors))
+
+
+def kappa(law: str) -> float:
+    """A law's default smoothing [J]."""
+    return FAMILIES[law].smoothing
+
+
+def tables(table: Table, laws: Table) -> dict[str, str]:
+    """Return every table of the page by its name; those of laws if there are cells of them."""
+    found = {name: make(table) for name, make in TABLES.items()}
+    if len(laws):
+        found |= {"laws_off": by_law(table, laws, off_of), "laws_variance": by_law(table, laws, ratio_of)}
+        found |= {"laws_smoothing": smoothing_table(laws)}
+    return found
 
 
 def write_page() -> None:
     """Regenerate the figures and tables of docs/atlas.md."""
-    table = read(RESULTS)
+    table, laws = (read(RESULTS, laws) for laws in (False, True))
     for name, make in FIGURES.items():
         save_figure(make(table), f"atlas_{name}")
-    write_tables(PAGE, tables(table))
+    if len(laws):
+        save_figure(laws_figure(table, laws), "atlas_laws")
+    write_tables(PAGE, tables(table, laws))

@@ -28,7 +28,9 @@ from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel, stable
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
+from mjx_study.simulation.law import Law
 from mjx_study.simulation.onset import as_row
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 SAMPLES: Final = 64
@@ -41,12 +43,20 @@ ESTIMATORS: Final = ("zobg", "fobg", "fobg_onset")
 
 
 class Programs:
-    """The two compiled programs of a task: rollouts, and gradients with and without the onset term."""
+    """The two compiled programs of a task: rollouts, and gradients with and without the onset term.
 
-    def __init__(self, task: Task):
-        self.task, self.direction = task, direction_along(task)
+    Under a law other than MuJoCo's there is no such term, so that gradients are those without; whether bodies meet is
+    known from `usual`, the programs of MuJoCo's law.
+    """
+
+    def __init__(self, task: Task, law: Law | None = None, usual: "Programs | None" = None):
+        self.task, self.direction, self.law, self.usual = task, direction_along(task), law, usual or self
         programs = SamplePrograms(task)
-        value = programs.by_name["value"]
+        value, gradient = programs.by_name["value"], programs.by_name["gradient"]
+
+        def plain(*given):
+            cost, slope, residual, _ = gradient(*given)
+            return cost, slope[None], residual, ()
 
         def gradients(theta, contact, sigma, key, scale):
             start, noise = programs.draw(sigma, key, scale)
@@ -61,12 +71,12 @@ class Programs:
 
         def of_rows(program):
             def run(along, solref, solimp, sigma, key, scale):
-                return program(along * self.direction, ContactModel(solref, solimp), sigma, key, scale)
+                return program(along * self.direction, ContactModel(solref, solimp, law=law), sigma, key, scale)
 
             return Compiled(jax.vmap(run))
 
         self._warm: set[str] = set()
-        self._programs = {"value": of_rows(value), "gradients": of_rows(gradients)}
+        self._programs = {"value": of_rows(value), "gradients": of_rows(plain if law else gradients)}
 
     def run(self, name: str, settings: Sequence[np.ndarray], keys: np.ndarray, scale: np.ndarray) -> tuple[Any, float]:
         """Return outputs `(cells, rows, ...)`, and seconds per row (NaN for a call that compiles).
@@ -144,10 +154,10 @@ def _statistics(plus: Evaluation, minus: Evaluation, pilot: Evaluation | None, g
     Args:
         plus, minus: evaluations with opposite noise.
         pilot: evaluation of the first-order samples; None for a feedback policy, whose reference averages pairs.
-        gradients: (samples, 2, params), without and with the onset term.
+        gradients: (samples, 1 or 2, params), without and with the onset term.
     """
     zeroth = zeroth_order(plus, "zero_noise")
-    plain, corrected = (summarise(gradients[:, which]) for which in range(2))
+    plain, *corrected = (summarise(gradients[:, which]) for which in range(gradients.shape[1]))
     kept = jnp.where(jnp.isfinite(plain.per_sample).all(axis=1)[:, None], plain.per_sample, jnp.nan)
     if pilot is None:
         reference = antithetic(plus, minus, "zero_noise")
@@ -165,7 +175,7 @@ def _statistics(plus: Evaluation, minus: Evaluation, pilot: Evaluation | None, g
     found = {"slope": jnp.mean(along), "slope_se": jnp.std(along, ddof=1) / jnp.sqrt(len(along))}
     found |= {"norm": jnp.linalg.norm(reference.mean)}
     found |= {"norm_se": jnp.linalg.norm(reference.standard_error)}
-    for name, estimate in zip(ESTIMATORS, (zeroth, plain, corrected), strict=True):
+    for name, estimate in zip(ESTIMATORS, (zeroth, plain, *corrected), strict=False):
         lower, upper = variance_interval(estimate, 0.95)
         found |= {f"{name}_variance": estimate.variance, f"{name}_lower": lower, f"{name}_upper": upper}
         found |= {f"{name}_effective": effective_samples(estimate).count}
@@ -189,9 +199,13 @@ def measure(programs: Programs, cells: Sequence[Cell]) -> dict[str, np.ndarray]:
     """Return all columns of some cells of one task and timestep."""
     task, additive = programs.task, programs.task.policy.additive
     contacts = [contact_of(task, cell) for cell in cells]
-    stacked = [np.stack([np.asarray(getattr(each, name)) for each in contacts]) for name in ("solref", "solimp")]
     sigmas = np.array([cell.sigma for cell in cells])
-    settings = [np.array([cell.theta for cell in cells]), *stacked, sigmas]
+
+    def settings_of(contacts: Sequence[ContactModel]) -> list[np.ndarray]:
+        stacked = (np.stack([np.asarray(getattr(each, name)) for each in contacts]) for name in ("solref", "solimp"))
+        return [np.array([cell.theta for cell in cells]), *stacked, sigmas]
+
+    settings = settings_of(contacts)
     root = jax.random.key(SEED)
     pairs, firsts = zip(*(jax.random.split(jax.random.fold_in(root, cell.index)) for cell in cells), strict=True)
     pairs, firsts = (
@@ -203,6 +217,11 @@ def measure(programs: Programs, cells: Sequence[Cell]) -> dict[str, np.ndarray]:
         "value", settings, np.concatenate([pairs, pairs, still], axis=1), scale
     )
     (gained, gradients, more, events), seconds = programs.run("gradients", settings, firsts, np.ones(SAMPLES))
+    if programs.law is not None:
+        (default,), _ = family_grid(task, ["mujoco_default"])
+        assert default.contact is not None
+        contacts = [default.contact] * len(cells)
+        (*_, events), _ = programs.usual.run("gradients", settings_of(contacts), firsts, np.ones(SAMPLES))
     ends = jnp.split(values, [SAMPLES, 2 * SAMPLES], axis=1)
     baseline = jnp.broadcast_to(ends[2], ends[0].shape)
     plus = Evaluation(ends[0], jnp.asarray(scores[:, :SAMPLES]), baseline)
@@ -221,8 +240,14 @@ def measure(programs: Programs, cells: Sequence[Cell]) -> dict[str, np.ndarray]:
     touched = {name: [each[name] for each in touched] for name in touched[0]}
     solved = [unconverged(np.concatenate(each, axis=None), "float64") for each in zip(residuals, more, strict=True)]
     columns |= dict(zip(ONSETS, onsets.T, strict=True)) | touched | {"unconverged": solved}
-    columns |= {"k": -stacked[0][:, 0], "b": -stacked[0][:, 1], "impedance": stacked[1][:, 0]}
-    columns |= {"stable": [stable(each.tolist(), task.scene.timestep) for each in stacked[0]]}
+    _, solref, solimp, _ = settings
+    if programs.law is None:
+        columns |= {"k": -solref[:, 0], "b": -solref[:, 1], "impedance": solimp[:, 0]}
+        columns |= {"stable": [stable(each.tolist(), task.scene.timestep) for each in solref]}
+    else:
+        k = np.array([cell.stiffness for cell in cells]) / task.effective_mass
+        b = 2 * np.array([cell.dampratio for cell in cells]) * np.sqrt(k)
+        columns |= {"k": k, "b": b, "impedance": [math.nan] * len(cells), "stable": np.ones(len(cells))}
     columns |= {name: [getattr(cell, name) for cell in cells] for name in ("index", *COLUMNS)}
     columns |= {"value_seconds": [value_seconds] * len(cells), "gradient_seconds": [seconds] * len(cells)}
     return {name: np.asarray(each, float) for name, each in columns.items()}

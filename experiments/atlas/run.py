@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+import itertools
 import json
 import math
 import multiprocessing
@@ -16,7 +17,20 @@ import mujoco
 import numpy as np
 
 from experiments import DATA
-from experiments.atlas.design import CELLS, FAMILIES, POINTS, PROGRAMS, TASKS, cells_of, task_of
+from experiments.atlas.design import (
+    CELLS,
+    FAMILIES,
+    LAWS,
+    POINTS,
+    PROGRAMS,
+    REFUSED,
+    TASKS,
+    Cell,
+    cells_of,
+    contact_of,
+    law_cells,
+    task_of,
+)
 from experiments.atlas.programs import SAMPLES, SEED, Programs, measure
 from mjx_study.disk import write_whole
 from mjx_study.runtime import configure, environment
@@ -34,66 +48,95 @@ LARGEST: Final = 200.0
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """Every `parts`-th cell of a task and timestep."""
+    """Every `parts`-th cell of a task and timestep, under MuJoCo's law or another one by name."""
 
     program: int
     part: int
     parts: int
+    law: str = ""
 
     @property
     def name(self) -> str:
-        return f"{self.program:02d}-{self.part}-of-{self.parts}"
+        return f"{self.program:02d}-{self.law}{self.part}-of-{self.parts}"
 
     @property
     def label(self) -> str:
         name, timestep = PROGRAMS[self.program]
-        return f"{name} at {timestep:g} s, {self.part + 1} of {self.parts}"
+        return f"{name} at {timestep:g} s, {self.law or f'{self.part + 1} of {self.parts}'}"
 
     @property
     def seconds(self) -> float:
         """Rough computing time [s]."""
         name, timestep = PROGRAMS[self.program]
         steps = task_of(name, timestep).horizon
-        return TASKS[name].cost * steps * POINTS * len(FAMILIES) / self.parts
+        return TASKS[name].cost * steps * POINTS * (1 if self.law else len(FAMILIES)) / self.parts
+
+    def cells(self, families: Sequence[str]) -> list[Cell]:
+        """The job's cells under some contact families, by the compiled programs that they need."""
+        if self.law:
+            return sorted(law_cells(self.program, self.law), key=lambda cell: cell.smoothing)
+        return [cell for cell in list(cells_of(self.program))[self.part :: self.parts] if cell.contact in families]
 
 
-def jobs() -> list[Job]:
-    """Return all jobs, longest first."""
-    unsplit = [Job(program, 0, 1) for program in range(len(PROGRAMS))]
-    counts = [math.ceil(job.seconds / LARGEST) for job in unsplit]
-    split = [Job(job.program, part, parts) for job, parts in zip(unsplit, counts, strict=True) for part in range(parts)]
-    return sorted(split, key=lambda job: -job.seconds)
+def jobs(families: Sequence[str] = FAMILIES) -> list[Job]:
+    """Return all jobs of some contact families, longest first."""
+    found = []
+    for program, (name, _) in enumerate(PROGRAMS):
+        found += [Job(program, 0, 1, law) for law in LAWS if law in families and (name, law) not in REFUSED]
+        if set(families) & set(FAMILIES):
+            parts = math.ceil(Job(program, 0, 1).seconds / LARGEST)
+            found += [Job(program, part, parts) for part in range(parts)]
+    return sorted(found, key=lambda job: -job.seconds)
 
 
-def compute(job: Job, folder: Path, done: frozenset[int], end: float, most: int | None) -> int:
+def blocks(cells: Sequence[Cell]) -> list[Sequence[Cell]]:
+    """Split cells into blocks of the same compiled programs."""
+    found: list[Sequence[Cell]] = []
+    for _, group in itertools.groupby(cells, lambda cell: cell.smoothing if cell.contact in LAWS else 0.0):
+        alike = list(group)
+        found += [alike[at : at + BLOCK] for at in range(0, len(alike), BLOCK)]
+    return found
+
+
+def compute(
+    job: Job, folder: Path, done: frozenset[int], end: float, most: int | None, families: Sequence[str] = FAMILIES
+) -> int:
     """Compute the missing cells of a job until time is up; return their number.
 
     Args:
         done: indices of the cells that exist.
         end: time limit, as `time.time`.
         most: maximum number of cells of each job; None for all.
+        families: contact families.
     """
     configure(cpu_devices=1)
     mujoco.set_mju_user_warning(lambda message: None)
-    planned = list(cells_of(job.program))[job.part :: job.parts][:most]
-    missing = [cell for cell in planned if cell.index not in done]
+    missing = [cell for cell in job.cells(families)[:most] if cell.index not in done]
     if not missing or time.time() > end - FEWEST:
         return 0
-    programs, parts, longest = Programs(task_of(*PROGRAMS[job.program])), [], 0.0
-    for at in range(0, len(missing), BLOCK):
+    task, parts, longest = task_of(*PROGRAMS[job.program]), [], 0.0
+    usual = programs = Programs(task)
+    for index, block in enumerate(blocks(missing)):
         begun = time.time()
         if begun + 1.5 * longest > end:
             break
-        parts.append(measure(programs, (missing[at : at + BLOCK] * BLOCK)[:BLOCK]))
-        parts[-1] = {name: each[: len(missing) - at] for name, each in parts[-1].items()}
+        law = contact_of(task, block[0]).law
+        if law != programs.law:
+            programs = Programs(task, law, usual)
+        found = measure(programs, (list(block) * BLOCK)[:BLOCK])
+        parts.append({name: each[: len(block)] for name, each in found.items()})
         write(folder / f"part-{job.name}-{os.getpid()}.npz", parts)
-        longest = max(longest, time.time() - begun) if at else 0.0  # the first one compiles
+        longest = max(longest, time.time() - begun) if index else 0.0  # the first one compiles
     return sum(len(part["index"]) for part in parts)
 
 
 def write(path: Path, parts: Sequence[dict[str, np.ndarray]], **more: Any) -> None:
-    """Write the columns of all parts as float32 with `DIGITS` bits, sorted by cell and without duplicates."""
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    """Write the columns of all parts as float32 with `DIGITS` bits, sorted by cell and without duplicates; NaN where a
+    part lacks a column."""
+    whole = [
+        {name: np.full(len(part["index"]), np.nan) for name in itertools.chain(*parts)} | dict(part) for part in parts
+    ]
+    joined = {name: np.concatenate([part[name] for part in whole]) for name in whole[0]}
     _, kept = np.unique(joined["index"], return_index=True)
     indices = joined["index"][kept].astype(np.int32)
     columns = {name: rounded(each[kept]) for name, each in joined.items()} | {"index": indices}
@@ -123,6 +166,25 @@ def about(path: Path) -> dict[str, Any]:
         return json.loads(str(file["about"]))
 
 
+def merge(path: Path, into: Path = RESULTS) -> None:
+    """Add the cells of a file to another; those of the first replace their like."""
+    found, environments = [], about(into)["environments"]
+    for each in (path, into):
+        made, columns = about(each)["environments"], read(each)
+        environments += [one for one in made if one not in environments]
+        places = np.array([environments.index(one) for one in made])
+        found.append(columns | {"environment": places[columns["environment"].astype(int)]})
+    write(into, found, about=described(environments))
+
+
+def described(environments: list[Any]) -> str:
+    """What a file says of itself; see `about`."""
+    tasks = [task_of(*program) for program in PROGRAMS]
+    text = {"environments": environments, "samples": SAMPLES, "seed": SEED, "programs": PROGRAMS}
+    text |= {"families": FAMILIES + LAWS, "durations": [task.horizon * task.scene.timestep for task in tasks]}
+    return json.dumps(text | {"params": [task.policy.num_params for task in tasks]})
+
+
 def condense(folder: Path) -> int:
     """Join the parts in a folder into its atlas.npz, and delete them; return the number of cells.
 
@@ -141,24 +203,21 @@ def condense(folder: Path) -> int:
             found.append(columns | {"environment": np.full(len(columns["index"]), environments.index(here))})
     if not found:
         return 0
-    tasks = [task_of(*program) for program in PROGRAMS]
-    described = {
-        "environments": environments,
-        "samples": SAMPLES,
-        "seed": SEED,
-        "programs": PROGRAMS,
-        "families": FAMILIES,
-    }
-    described |= {"durations": [task.horizon * task.scene.timestep for task in tasks]}
-    described |= {"params": [task.policy.num_params for task in tasks]}
-    write(joined, found, about=json.dumps(described))
+    write(joined, found, about=described(environments))
     for path in parts:
         path.unlink()
     return len(read(joined)["index"])
 
 
-def run(folder: Path, workers: int, seconds: float, most: int | None = None, only: Sequence[str] = ("",)) -> None:
-    """Compute in as many processes as workers until time is up."""
+def run(
+    folder: Path,
+    workers: int,
+    seconds: float,
+    most: int | None = None,
+    only: Sequence[str] = ("",),
+    families: Sequence[str] = FAMILIES,
+) -> None:
+    """Compute the cells of some contact families in as many processes as workers until time is up."""
     end = time.time() + seconds
     folder.mkdir(parents=True, exist_ok=True)
     os.environ["JAX_PLATFORMS"] = "cpu"
@@ -166,12 +225,13 @@ def run(folder: Path, workers: int, seconds: float, most: int | None = None, onl
     jax.config.update("jax_enable_x64", True)  # as in the workers, for `environment`
     before = condense(folder)
     done = frozenset(read(folder / RESULTS.name)["index"].tolist()) if before else frozenset()
-    chosen = [job for job in jobs() if any(part in job.label for part in only)]
+    chosen = [job for job in jobs(families) if any(part in job.label for part in only)]
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(workers, context, max_tasks_per_child=1) as pool:
-        waiting = {pool.submit(compute, job, folder, done, end, most): job for job in chosen}
+        waiting = {pool.submit(compute, job, folder, done, end, most, families): job for job in chosen}
         for future in concurrent.futures.as_completed(waiting):
             left = max(0.0, end - time.time())
             outcome = future.exception() or f"{future.result()} cells"
             print(f"{waiting[future].label}: {outcome}; {left:.0f} s left", flush=True)
-    print(f"{condense(folder)} of {CELLS} cells in {folder / RESULTS.name}; {before} existed before", flush=True)
+    total = CELLS + sum(len(job.cells(families)) for job in jobs(LAWS))
+    print(f"{condense(folder)} of {total} cells in {folder / RESULTS.name}; {before} existed before", flush=True)

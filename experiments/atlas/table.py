@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from estimators import ENOUGH_EFFECTIVE
+from experiments.atlas.design import CELLS
 from mjx_study.diagnose.advice import SMOOTH_SHARE, WIDTH_RATIO
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
 
@@ -35,11 +36,15 @@ GROUPS: Final = {
 """Dimensionless groups: symbol and meaning."""
 
 
-def read(path: Path) -> Table:
-    """Return the atlas with its groups and verdicts, one row per cell."""
+def read(path: Path, laws: bool = False) -> Table:
+    """Return the atlas with its groups and verdicts, one row per cell: under MuJoCo's law, or under the others.
+
+    The others have no onset, so that their groups of it are those of the same rollouts under MuJoCo's default contact.
+    """
     with np.load(path) as file:
         about = json.loads(str(file["about"]))
-        table = pd.DataFrame({name: file[name] for name in file.files if name != "about"}).astype({"index": int})
+        every: Table = pd.DataFrame({name: file[name] for name in file.files if name != "about"}).astype({"index": int})
+    table = every[(every["index"] >= CELLS) == laws].reset_index(drop=True)
     programs = table["program"].astype(int)
     table["task"] = [about["programs"][each][0] for each in programs]
     table["timestep"] = [about["programs"][each][1] for each in programs]

@@ -35,6 +35,7 @@ class Engine:
         how: way of differentiation, as the engine's documentation has it.
         single: whether it computes in float32.
         slow: whether its cells have fewer rollouts, judge's `FEW`.
+        left: why cells of it were not measured.
     """
 
     label: str
@@ -44,6 +45,7 @@ class Engine:
     how: str
     single: bool = False
     slow: bool = False
+    left: str = "not run"
 
 
 ENVIRONMENTS: Final = {
@@ -82,7 +84,15 @@ ENGINES: Final = {
         f"newton_{name}": Engine(f"Newton 1.8.0, {name}", "newton", "newton_warp", name, "Warp's tape", single=True)
         for name in ("semi_implicit",)
     },
-    "newton_1_0": Engine("Newton 1.0.0, semi_implicit", "newton_1_0", "newton_warp", "old", "Warp's tape", single=True),
+    "newton_1_0": Engine(
+        "Newton 1.0.0, semi_implicit",
+        "newton_1_0",
+        "newton_warp",
+        "old",
+        "Warp's tape",
+        single=True,
+        left="a positive control, whose bodies touch nothing",
+    ),
     "jaxsim": Engine("JaxSim 0.9.0, soft", "jaxsim", "jaxsim_soft", "SemiImplicitEuler", "reverse mode"),
     **{
         f"drake_{name}": Engine(f"Drake 1.58.0, {name}", "drake", "drake_plant", name, "AutoDiffXd")
@@ -91,11 +101,19 @@ ENGINES: Final = {
     "nimble": Engine("Nimble 0.10.52", "nimble", "nimble_physics", "lcp", "torch's tape"),
     **{
         f"mujoco_torch_{name}": Engine(
-            f"mujoco-torch 0.2.0, {name}", "mujoco_torch", "mujoco_torch_tape", name, how, slow=True
+            f"mujoco-torch 0.2.0, {name}",
+            "mujoco_torch",
+            "mujoco_torch_tape",
+            name,
+            how,
+            slow=True,
+            left="not run, at 0.1 to 0.3 s per gradient",
         )
         for name, how in (("plain", "torch's tape"), ("soft", "torch's tape, differentiable_mode"))
     },
-    "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode"),
+    "old_mjx": Engine(
+        "MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode", left="a control, of the toss alone"
+    ),
 }
 
 

@@ -1,5 +1,6 @@
 """The tables of docs/engines.md, from data/engines.jsonl alone."""
 
+import itertools
 import json
 from collections import Counter
 from collections.abc import Mapping
@@ -82,12 +83,17 @@ def _checks(found: Cells, checks: Cells) -> str:
 
 
 def _reasons(found: Cells) -> str:
-    """Why scenes were not measured: the engines' reasons, and their cells."""
-    cells: dict[tuple[str, str], list[str]] = {}
-    for (name, scene, step), cell in found.items():
-        if "error" in cell and step == TIMESTEPS[0]:
-            cells.setdefault((ENGINES[name].label, cell["error"]), []).append(scene)
-    rows = [markdown_row(label, ", ".join(scenes), reason) for (label, reason), scenes in cells.items()]
+    """Why cells have no numbers: the engine's reason, or that of its cells which were not measured."""
+    scenes: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for name, scene, step in itertools.product(ENGINES, SCENES, TIMESTEPS):
+        cell = found.get((name, scene, step))
+        if cell is None or "error" in cell:
+            reason = ENGINES[name].left if cell is None else cell["error"]
+            scenes.setdefault((ENGINES[name].label, reason), {}).setdefault(scene, []).append(step)
+    rows = []
+    for (label, reason), steps in scenes.items():
+        named = (each + ("" if len(of) == len(TIMESTEPS) else f" at {1000 * of[0]:g} ms") for each, of in steps.items())
+        rows.append(markdown_row(label, ", ".join(named), reason))
     return "\n".join([markdown_row("engine", "scenes", "reason"), "|---|---|---|", *rows])
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
+from mjx_study.choices import laws_of
 from mjx_study.claims.laboratory import Effort, Laboratory, Statistic
 from mjx_study.identity import VERSIONED, code_of
 from mjx_study.runtime import precision
@@ -74,6 +75,11 @@ class Claim:
     measure: Callable[..., Statistic]
     show: str = ""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def of_laws(self) -> bool:
+        """Whether the claim is about contact laws other than MuJoCo's, which need the extra `laws`."""
+        return bool(laws_of(family for _, family in self.cases))
 
     @property
     def cases(self) -> list[tuple[str, str]]:

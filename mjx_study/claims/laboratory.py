@@ -19,7 +19,9 @@ from jaxtyping import Float
 import estimators
 from estimators import Estimator, GradientEstimate, Objective
 from estimators.confidence import student_quantile
-from mjx_study.choices import REFERENCE
+from mjx_study.choices import FAMILIES as CONTACTS
+from mjx_study.choices import REFERENCE, laws_of
+from mjx_study.claims.thrown import THROWN
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.quadrature import Line, means
 from mjx_study.objective import Simulator
@@ -32,9 +34,10 @@ from mjx_study.tasks.task import Task
 
 FAMILIES: Final = (
     REFERENCE, "penalty", "impedance", "mujoco", "mujoco_default", "mujoco_stiff", "smooth_onset", "mjcf",
+    *laws_of(CONTACTS),
 )  # fmt: skip
 """Columns of the verdict matrix."""
-REAL: Final = FAMILIES[1:-1]
+REAL: Final = FAMILIES[1 : FAMILIES.index("mjcf")]
 """MJX contact families to compare; "mjcf" is for systems without contact."""
 TIMED: Final = 64
 """Samples per device in a timed batch."""
@@ -189,15 +192,19 @@ class Laboratory:
         return run_study(config, folder, accept_versions=self._accept)
 
     def _task(self, name: str, timestep: float | None = None, onset: str = "none") -> Task:
-        task = make_task(name)
+        task = THROWN[name]() if name in THROWN else make_task(name)
         if timestep is not None:
             horizon = round(task.horizon * task.scene.timestep / timestep)
             task = make_task(name, timestep=timestep, horizon=horizon)
         return task.replace(onset=onset)
 
-    def _contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactModel | None:
-        """Contact model of a family, with exact derivatives or those of one of `RELAXATIONS`."""
-        (cell,), _ = family_grid(task, (family,), (stiffness,))
+    def _contact(
+        self, task: Task, family: str, stiffness: float, relaxed: str | None = None, smoothing: float = 1.0
+    ) -> ContactModel | None:
+        """Contact model of a family, with exact derivatives or those of one of `RELAXATIONS`; `smoothing` is a factor
+        on that of a law other than MuJoCo's."""
+        kappa = CONTACTS[family].smoothing * smoothing if laws_of((family,)) else None
+        (cell,), _ = family_grid(task, (family,), (stiffness,), smoothing=kappa)
         if relaxed is not None:
             other, factor, margin = RELAXATIONS[relaxed]
             (cell,), _ = backward_grid(task, (cell,), (other,), factor * cell.stiffness_or_zero, margin)
@@ -205,12 +212,12 @@ class Laboratory:
 
     def _landscape(
         self, name: str, family: str, stiffness: float, low: float, high: float, sigma: float,
-        timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
+        timestep: float | None = None, onset: str = "none", relaxed: str | None = None, smoothing: float = 1.0,
     ) -> Landscape:  # fmt: skip
         """Landscape of a task between two parameters, extended by the noise around them."""
         task = self.task(name, timestep, onset)
         points = np.arange(low - 5.4 * sigma, high + 5.4 * sigma, sigma / self.effort.density)
-        contact = self._contact(task, family, stiffness, relaxed)
+        contact = self._contact(task, family, stiffness, relaxed, smoothing)
         return Landscape(points, *self._line(name, timestep, onset)(points, contact))
 
     def objective(self, name: str, family: str, stiffness: float) -> Objective:
@@ -228,7 +235,7 @@ class Laboratory:
 
     def slopes(
         self, name: str, family: str, theta: float, *, stiffness: float, sigma: float | None = None,
-        timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
+        timestep: float | None = None, onset: str = "none", relaxed: str | None = None, smoothing: float = 1.0,
     ) -> Slopes:  # fmt: skip
         """Gradient and means at theta by quadrature, or in closed form for the analytic system."""
         task = self.task(name)
@@ -237,7 +244,7 @@ class Laboratory:
             reference = task.analytic(stiffness)
             assert isinstance(reference, FunctionObjective)
             return closed_form(reference.function, theta, sigma)
-        table = self.landscape(name, family, stiffness, theta, theta, sigma, timestep, onset, relaxed)
+        table = self.landscape(name, family, stiffness, theta, theta, sigma, timestep, onset, relaxed, smoothing)
         found = means(table.points, table.values, table.slopes, np.array([theta]), sigma, task.noise)
         slope, first = float(found.slope[0]), float(found.first[0])
         errors = float(found.slope_error[0]) / abs(slope), float(found.first_error[0]) / abs(slope)

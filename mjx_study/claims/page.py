@@ -24,9 +24,10 @@ def run_summary(document: dict[str, Any]) -> str:
     made = document["environment"]
     versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items() if name != "mjx-study")
     return (
-        f"All {document['verdicts']} intervals of the ledger, each at level {document['level']:.5f}, hold at once with "
-        f"probability {1 - document['alpha']:g} (Bonferroni); they include estimates of the quadrature error, which "
-        f"are not bounds. Measured with `{document['command'] or 'measure_ledger'}` on {made['cores']} cores "
+        f"All {document['verdicts']} intervals on MuJoCo's contact and on analytic systems, each at level "
+        f"{document['level']:.5f}, hold at once with probability {1 - document['alpha']:g} (Bonferroni); those on "
+        f"other laws have no sampling error. All include estimates of the quadrature error, which are not bounds. "
+        f"Measured with `{document['command'] or 'measure_ledger'}` on {made['cores']} cores "
         f"({made['processor']}), {made['precision']}; {versions}."
     )
 
@@ -35,7 +36,9 @@ def verdict_counts(document: dict[str, Any]) -> str:
     """Count the verdicts of each kind."""
     found = Counter(each["verdict"] for claim in document["claims"] for each in claim["evidence"])
     listed = ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS if found[verdict])
-    return f"{len(document['claims'])} claims, {sum(found.values())} verdicts: {listed}"
+    without = document.get("not_checked", 0)
+    missing = f"; not checked: {without}, which need mjx-study[laws]" if without else ""
+    return f"{len(document['claims'])} claims, {sum(found.values())} verdicts: {listed}{missing}"
 
 
 def matrix_lines(document: dict[str, Any]) -> list[str]:

@@ -37,7 +37,7 @@ NONE: Final[Changes] = MappingProxyType({})
 
 
 def at(lab: Laboratory, system: str, family: str, stiffness: float = STIFFNESS, **changes: Any) -> Slopes:
-    """Landscape of a system under a family, at the angle and with the relaxed derivatives given in its name.
+    """Landscape of a system under a family, at the angle or height and with the relaxed derivatives given in its name.
 
     Changes are those of `Laboratory.slopes`; `relaxed="none"` stands for exact derivatives.
     """
@@ -48,7 +48,7 @@ def at(lab: Laboratory, system: str, family: str, stiffness: float = STIFFNESS, 
     task, angle, *relaxed = system.split(", ")
     changes = {"relaxed": relaxed[0] if relaxed else None} | changes
     changes["relaxed"] = None if changes["relaxed"] == "none" else changes["relaxed"]
-    return lab.slopes(task, family, float(angle.removesuffix(" rad")), stiffness=stiffness, **changes)
+    return lab.slopes(task, family, float(angle.split()[0]), stiffness=stiffness, **changes)
 
 
 def pair(lab: Laboratory, system: str, family: str, one: Changes, other: Changes) -> list[Slopes]:

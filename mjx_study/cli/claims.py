@@ -16,7 +16,8 @@ samples that would decide is printed. All intervals hold simultaneously with pro
 claims are run.
 
 With --output, measurements are saved as they are made: a stopped run can be resumed, and a claim whose definition or
-code has changed is measured again. The folder also gets claims.json, claims.md and claims.png.
+code has changed is measured again. The folder also gets claims.json, claims.md and claims.png. Claims on contact laws
+other than MuJoCo's need the extra `laws`; without it they are counted as not checked.
 
 examples:
   mjx-study claims --quick --output out
@@ -44,6 +45,7 @@ def run(options: argparse.Namespace) -> int:
     from mjx_study.claims.page import draw_matrix, markdown, matrix_lines, run_summary, undecided, verdict_counts
     from mjx_study.disk import prepare_folder, write_whole
     from mjx_study.plots.style import save_figure
+    from mjx_study.simulation.law import INSTALL, installed
 
     names = [name for part in options.only or CLAIMS for name in part.split(",")]
     for name in names:
@@ -58,6 +60,8 @@ def run(options: argparse.Namespace) -> int:
         ]
         lines = [f"{each['id']}\n  {each['statement']}\n  {each['quantity']}: {each['criterion']}" for each in listed]
         return print_report(options, {"claims": listed}, lines)
+    if all(claim.of_laws for claim in chosen) and not installed():
+        raise UsageError(f"{chosen[0].id} {INSTALL}")
     if options.accept_versions and options.output is None:
         raise UsageError("--accept-versions needs the folder to resume: give --output")
     with usage_errors():

@@ -21,6 +21,7 @@ Reference: MuJoDiCo 3.17, `solver_sap_util` and `solver_conic`; Castro et al. (a
 import copy
 import dataclasses
 import functools
+import importlib.util
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -36,6 +37,7 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import integrate_position
 from mjx_study.simulation.scene import Scene
 
+PACKAGE: Final = "mujodico"
 INSTALL: Final = "needs MuJoDiCo: pip install 'mjx-study[laws]'"
 STIFFNESS_SCALE: Final = 100.0
 """MuJoDiCo's stiffness [N/m] over MuJoCo's k / d_width^2 [1/s^2]."""
@@ -213,6 +215,11 @@ LAWS: Final[dict[str, type[Law]]] = dict.fromkeys(
     ("hunt_crossley", "kelvin_voigt", "log_barrier", "conic"), MujodicoLaw
 )
 """Laws by the name of their contact family."""
+
+
+def installed() -> bool:
+    """Whether the laws' package is."""
+    return importlib.util.find_spec(PACKAGE) is not None
 
 
 def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
