@@ -15,7 +15,6 @@ from estimators import ORACLES, Linearisation
 from mjx_study.experiment.memory import PADDED, batches_at_once, padded_seeds, padded_size
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.objective import MjxObjective, Simulator
-from mjx_study.objective.chunks import used_share
 from mjx_study.reference import Reference
 from mjx_study.tasks.task import Task
 
@@ -102,8 +101,7 @@ def draw_batches(
         device: context held during each timed call.
 
     Returns:
-        By oracle: the batch, on CPUs as NumPy arrays; its computing time in full chunks [s]; and each rollout's solver
-        residual.
+        By oracle: the batch, on CPUs as NumPy arrays; its computing time [s]; and each rollout's solver residual.
     """
     together, on_host = batches_at_once(samples), jax.default_backend() == "cpu"
     drawn, seconds, residuals = {}, {}, {}
@@ -112,12 +110,10 @@ def draw_batches(
         parts, seconds[name] = [], 0.0
         for start in range(0, len(streams), together):
             flat = _keys_of_seeds(rows_of_keys(streams, slice(start, start + together)), first, samples)
-            simulated = isinstance(objective, MjxObjective)
-            share = used_share(len(flat), objective.simulator.chunk_size) if simulated else 1.0
             with device:
                 begun = time.perf_counter()
                 batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
-                seconds[name] += (time.perf_counter() - begun) * share
+                seconds[name] += time.perf_counter() - begun
             residuals[name] = np.concatenate([residuals.get(name, np.zeros(0)), residuals_of(batch)])
             batch = jax.device_get(batch) if on_host else batch
             parts.append(jax.tree.map(lambda leaf: leaf.reshape(len(leaf) // samples, samples, *leaf.shape[1:]), batch))
