@@ -1,6 +1,7 @@
 """Steps of more degrees of freedom than XLA unrolls, in native code: the engine's, with their derivatives."""
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from experiments.drop_in import MODELS
 from mjx_study.graph import operation, scalars
 from mjx_study.graph.build import known_libraries
 from mjx_study.graph.native import SWITCH, native_identity, native_summary
@@ -228,10 +230,18 @@ def test_second_derivatives_of_large_maps_are_those_of_jax(
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+def quadruped_of_mjx() -> Scene:
+    """MJX's `barkour_v0` on its height field, with a budget of the solver that does not end it."""
+    host = mujoco.MjModel.from_xml_path(str(MODELS["`barkour_v0`, a quadruped"]))
+    host.opt.iterations, host.opt.ls_iterations = 100, 50
+    return put_scene(host, "barkour_v0")
+
+
 @pytest.mark.slow
-def test_a_quadrupeds_steps_are_those_of_mjxs_arrays() -> None:
+@pytest.mark.parametrize("load", [partial(load_scene, "quadruped"), quadruped_of_mjx])
+def test_a_quadrupeds_steps_are_those_of_mjxs_arrays(load: Callable[[], Scene]) -> None:
     """Values and adjoints to rounding, in and out of contact, against JAX's operations with the same solver."""
-    scene = load_scene("quadruped")
+    scene = load()
     point, draw = states(scene.host, 64), np.random.default_rng(1)
     adjoints = [draw.normal(size=each.shape) for each in point[:2]]
 

@@ -65,7 +65,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
     forms_in = [(math.prod(each.shape), each.dtype, each.ndim) for each in types]
     forms_out = [(math.prod(each.shape), each.dtype, each.ndim) for each in avals]
     if platform == "gpu":
-        kernel = [_text("prelude.cu"), _text("functions.c"), *functions, _text("kernel.cu")]
+        kernel = [_text("prelude.cu"), _text("functions.c"), *writer.tables, *functions, _text("kernel.cu")]
         parts = ["#ifdef __CUDACC_RTC__", *kernel, "#else", _text("launcher.c"), "#endif"]
         return "\n".join([_batch(forms_in, forms_out), f"#define KEPT {num_kept}", *parts, ""])
     wide = any(dtype.itemsize == 8 for dtype in writer.dtypes)
@@ -78,6 +78,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
             f"#define KEPT {num_kept}",
             _text("prelude.c"),
             _text("functions.c"),
+            *writer.tables,
             *functions,
             _text("handler.c"),
         ]
@@ -124,14 +125,18 @@ def _type(dtype: Any) -> str:
 
 @no_type_check
 def _constant(value: Any) -> str:
-    kind, value = _type(value.dtype), value.item()
+    kind = _type(value.dtype)
+    return f"ALL({kind}, {_literal(kind, value.item())})"
+
+
+def _literal(kind: str, value: Any) -> str:
     if kind == "mask":
-        return f"ALL(mask, {-int(value)})"
+        return str(-int(value))
     if isinstance(value, int):
-        return f"ALL({kind}, {value + 1} - 1)" if value < 0 else f"ALL({kind}, {value}{'u' if kind[0] == 'u' else ''})"
+        return f"{value + 1} - 1" if value < 0 else f"{value}{'u' if kind[0] == 'u' else ''}"
     if math.isfinite(value):
-        return f"ALL({kind}, {value!r}{'f' if kind == 'f32' else ''})"
-    return f"ALL({kind}, {'NAN' if math.isnan(value) else 'INFINITY' if value > 0 else '-INFINITY'})"
+        return f"{value!r}{'f' if kind == 'f32' else ''}"
+    return "NAN" if math.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
 
 
 @no_type_check
@@ -148,6 +153,15 @@ class _Writer:
         self._places: dict[int, tuple[int, int]] = {}
         self._uses: set[int] = set()
         self._before: list[str] = []
+        self._tables: dict[tuple[str, tuple[Any, ...]], str] = {}
+
+    @property
+    def tables(self) -> list[str]:
+        """Definitions of the constant vectors that the statements read at computed indices."""
+        return [
+            f"CONSTANTS({kind}) {name}[] = {{{', '.join(_literal(kind, each) for each in entries)}}};"
+            for (kind, entries), name in self._tables.items()
+        ]
 
     def statements(self) -> list[Statement | Loop]:
         """All statements, with every output stored as soon as it is known."""
@@ -251,6 +265,14 @@ class _Writer:
                     (place, at), kind = self._places[first.number], _type(node.dtype)
                     where = f"{place}, {at} + {node.parameters} * {self._value(index)}"
                     line = f"{kind} x{node.number} = ENTRY({kind}, {where});"
+                    found.append(self._statement([line], {node.number: kind}))
+                case "table":
+                    kind, (index,) = _type(node.dtype), node.arguments
+                    table = self._tables.setdefault(
+                        (kind, tuple(node.parameters.tolist())), f"table{len(self._tables)}"
+                    )
+                    line = f"{kind} x{node.number} = TABLE({kind}, {table}, {self._value(index)});"
+                    self.dtypes.add(node.dtype)
                     found.append(self._statement([line], {node.number: kind}))
                 case "whole":
                     raise NotWrittenError(node.parameters[0].primitive.name)

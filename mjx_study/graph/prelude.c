@@ -87,6 +87,13 @@ SELECT(u8, i8)
                 sizeof(r[0]));                                                                                       \
     r;                                                                                                               \
   })
+#define CONSTANTS(type) static const __typeof__(((type){0})[0])
+#define TABLE(type, table, at)                      \
+  ({                                                \
+    type r;                                         \
+    EACH r[lane] = (table)[(at)[lane]];             \
+    r;                                              \
+  })
 #define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
 #define STORE_BOOL(place, at, value) STORE(u8, place, at, AS(u8, (value) & 1))
 

@@ -48,6 +48,8 @@ ONE mask select_bool(mask m, mask no, mask yes) { return m ? yes : no; }
 #define KEEP(type, slot, value) (*(type *)(kept + (slot) * 8) = (value))
 #define RECALL(type, slot) (*(const type *)(kept + (slot) * 8))
 #define ENTRY LOAD
+#define CONSTANTS(type) static __device__ const type
+#define TABLE(type, table, at) ((table)[at])
 #define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
 #define STORE_BOOL(place, at, value) STORE(u8, place, at, (value) & 1)
 
