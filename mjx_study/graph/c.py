@@ -39,8 +39,9 @@ _NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for n
 
 MAX_ARGUMENT: Final = 4000
 """Maximum size of a kernel's argument [bytes]."""
-MOST_TOGETHER: Final = {"cpu": 500, "gpu": 20_000}
-"""Maximum number of statements in a function; compilers allocate registers in more than linear time."""
+MOST_TOGETHER: Final = {"cpu": (500, 500), "gpu": (5_000, 20_000)}
+"""Maximum numbers of lines in a function and in a loop that stays in one; compilers allocate registers in more than
+linear time."""
 
 
 class NotWrittenError(Exception):
@@ -60,7 +61,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
     """
     writer = _Writer(function)
     statements = writer.statements() if passes is None else writer.loop(passes)
-    functions, num_kept = in_parts(statements, writer.loads, MOST_TOGETHER[platform])
+    functions, num_kept = in_parts(statements, writer.loads, *MOST_TOGETHER[platform])
     types, avals = (function.types, function.avals) if passes is None else passes.avals(function)
     forms_in = [(math.prod(each.shape), each.dtype, each.ndim) for each in types]
     forms_out = [(math.prod(each.shape), each.dtype, each.ndim) for each in avals]

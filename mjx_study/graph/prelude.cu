@@ -20,10 +20,11 @@ typedef int mask;  // -1 or 0
 #define BITS(type, value) bits<type>(value)
 #define MASK(comparison) (-(mask)(comparison))
 #define ALL(type, constant) ((type)(constant))
-#define APART static __device__
+#define APART static __device__ __noinline__
 #define PART static __device__
 #define ARGUMENTS const struct batch &batch, const long lane, char *kept, long step
 #define PASSED batch, lane, kept, step
+#define ENTER __builtin_assume(__isLocal(kept));
 
 ONE int any(mask m) { return m; }
 
