@@ -48,14 +48,20 @@ def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarr
 
 
 def prepared(
-    host: mujoco.MjModel, step: Callable[..., mjx.Data], iterations: int, gradient: bool, batch: int
+    host: mujoco.MjModel,
+    step: Callable[..., mjx.Data],
+    iterations: int,
+    gradient: bool,
+    batch: int,
+    control: np.ndarray | None = None,
 ) -> Callable[[], Any]:
     """Compile a batch of rollouts of `STEPS` steps, or their gradients over initial velocity and controls, to be called
-    without arguments; its result is the last positions, or the gradients."""
+    without arguments; its result is the last positions, or the gradients. The control is 0 by default."""
     model, data = mjx.put_model(host), mjx.make_data(host)
     model = model.replace(opt=model.opt.replace(iterations=iterations))
     qpos, qvel = start_states(host, batch)
-    inputs = jax.device_put((qvel, np.zeros((batch, STEPS, host.nu)), qpos))
+    controls = np.broadcast_to(np.zeros(host.nu) if control is None else control, (batch, STEPS, host.nu))
+    inputs = jax.device_put((qvel, controls, qpos))
 
     def last(qvel, controls, qpos):
         def advance(data, control):

@@ -3,8 +3,9 @@
     python -m experiments.robots ROBOT ...    # all of `ROBOTS` without names; each route in a process of its own
     python -m experiments.robots --page       # only the page
 
-Each route rolls out `STEPS` steps from states in contact, solved to rounding (`BUDGET`), but for stock MJX's gradients,
-which one iteration of its solver gives. Rates are those of the fastest of several calls, with the inputs on the device.
+Each route rolls out `STEPS` steps from states in contact, under the control that holds them there, solved to rounding
+(`BUDGET`), but for stock MJX's gradients, which one iteration of its solver gives. Rates are those of the fastest of
+several calls, with the inputs on the device.
 Building is the time to the first result of a process with empty caches, tracing included: of rollouts, then of their
 gradients. What takes a route longer than `MOST_SECONDS` is left out.
 """
@@ -69,6 +70,11 @@ def loaded(name: str) -> mujoco.MjModel:
     return host
 
 
+def standing(host: mujoco.MjModel) -> np.ndarray:
+    """Controls of the first keyframe, 0 without one."""
+    return host.key_ctrl[0] if host.nkey else np.zeros(host.nu)
+
+
 def measure(name: str, route: str) -> None:
     """Print, after each kind of program, million steps per second and seconds to the first result of all so far."""
     mjx_study.configure()
@@ -80,7 +86,8 @@ def measure(name: str, route: str) -> None:
         if route == "engine":
             call = by_engine(host, size)
         else:
-            call = prepared(host, step, 1 if gradient and route == "stock" else BUDGET[0], gradient, size)
+            iterations = 1 if gradient and route == "stock" else BUDGET[0]
+            call = prepared(host, step, iterations, gradient, size, standing(host))
         call()
         built = time.perf_counter() - begun
         best = min(interleaved({kind: call}, REPEATS)[kind])
@@ -96,7 +103,7 @@ def by_engine(host: mujoco.MjModel, batch: int) -> Callable[[], Any]:
     qpos, qvel = start_states(host, batch)
     start = np.zeros((batch, mujoco.mj_stateSize(host, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     start[:, 1 : 1 + host.nq + host.nv] = np.concatenate([qpos, qvel], axis=1)
-    controls = np.zeros((batch, STEPS, host.nu))
+    controls = np.broadcast_to(standing(host), (batch, STEPS, host.nu))
     run = mujoco.rollout.Rollout(nthread=len(data))
     return partial(run.rollout, host, data, start, controls)
 
@@ -151,7 +158,7 @@ def write_page() -> None:
     rows = {(each["platform"], each["robot"], each["route"]): each["found"] for each in map(json.loads, open(RESULTS))}
     header = [f"{what}: {kind}" for what, kind in (*COLUMNS.values(), ("building [s]", "native"))]
     tables = {}
-    for platform in SAMPLES:
+    for platform in sorted({platform for platform, *_ in rows}):
         lines = []
         for name in ROBOTS:
             found = {route: rows.get((platform, name, route), {}) for route in ROUTES}
