@@ -47,34 +47,44 @@ def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarr
     return np.tile(data.qpos, (batch, 1)), data.qvel + 0.1 * noise.standard_normal((batch, host.nv))
 
 
+def prepared(
+    host: mujoco.MjModel,
+    step: Callable[..., mjx.Data],
+    iterations: int,
+    gradient: bool,
+    batch: int,
+    control: np.ndarray | None = None,
+) -> Callable[[], Any]:
+    """Compile a batch of rollouts of `STEPS` steps, or their gradients over initial velocity and controls, to be called
+    without arguments; its result is the last positions, or the gradients. The control is 0 by default."""
+    model, data = mjx.put_model(host), mjx.make_data(host)
+    model = model.replace(opt=model.opt.replace(iterations=iterations))
+    qpos, qvel = start_states(host, batch)
+    controls = np.broadcast_to(np.zeros(host.nu) if control is None else control, (batch, STEPS, host.nu))
+    inputs = jax.device_put((qvel, controls, qpos))
+
+    def last(qvel, controls, qpos):
+        def advance(data, control):
+            return step(model, data.replace(ctrl=control)), None
+
+        end = jax.lax.scan(advance, data.replace(qpos=qpos, qvel=qvel), controls)[0]
+        return jnp.sum(end.qpos) + jnp.sum(end.qvel), end.qpos
+
+    each = jax.grad(last, argnums=(0, 1), has_aux=True) if gradient else last
+    compiled = jax.jit(jax.vmap(lambda *inputs: each(*inputs)[0 if gradient else 1])).lower(*inputs).compile()
+    return lambda: jax.block_until_ready(compiled(*inputs))
+
+
 def measured(path: Path, batch: int) -> dict[str, float]:
     """Return median seconds of a batch of rollouts and of their gradients, through both steps."""
     host = mujoco.MjModel.from_xml_path(str(path))
-    model, data = mjx.put_model(host), mjx.make_data(host)
-    qpos, qvel = start_states(host, batch)
-    controls = np.zeros((batch, STEPS, host.nu))
-
-    def program(step: Callable[..., mjx.Data], iterations: int, gradient: bool) -> Callable[[], Any]:
-        stepped = model.replace(opt=model.opt.replace(iterations=iterations))
-
-        def last(qvel, controls, qpos):
-            def advance(data, control):
-                return step(stepped, data.replace(ctrl=control)), None
-
-            end = jax.lax.scan(advance, data.replace(qpos=qpos, qvel=qvel), controls)[0]
-            return jnp.sum(end.qpos) + jnp.sum(end.qvel)
-
-        function = jax.grad(last, argnums=(0, 1)) if gradient else last
-        compiled = jax.jit(jax.vmap(function)).lower(qvel, controls, qpos).compile()
-        return lambda: jax.block_until_ready(compiled(qvel, controls, qpos))
-
     budget = int(host.opt.iterations)
     programs = {
-        "stock": program(mjx.step, budget, gradient=False),
-        "ours": program(mjx_study.step, budget, gradient=False),
-        "stock_gradient": program(mjx.step, 1, gradient=True),
-        "gradient": program(mjx_study.step, budget, gradient=True),
-        "gradient_once": program(mjx_study.step, 1, gradient=True),
+        "stock": prepared(host, mjx.step, budget, False, batch),
+        "ours": prepared(host, mjx_study.step, budget, False, batch),
+        "stock_gradient": prepared(host, mjx.step, 1, True, batch),
+        "gradient": prepared(host, mjx_study.step, budget, True, batch),
+        "gradient_once": prepared(host, mjx_study.step, 1, True, batch),
     }
     times = interleaved(programs, REPEATS + 1)
     return {name: statistics.median(seconds[1:]) for name, seconds in times.items()} | {"nv": host.nv, "budget": budget}

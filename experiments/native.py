@@ -9,6 +9,7 @@ left out.
 """
 
 import argparse
+import itertools
 import json
 import math
 import os
@@ -16,8 +17,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import jax
@@ -82,25 +84,30 @@ def main() -> None:
     if given.route:
         measure(*given.tasks)
         return
-    for name in () if given.page else given.tasks:
-        for route, switch in ROUTES.items():
-            with tempfile.TemporaryDirectory() as folder:
-                environment = os.environ | {SWITCH: switch, "XDG_CACHE_HOME": folder}
-                command = [sys.executable, "-m", "experiments.native", "--route", name]
-                try:
-                    done = subprocess.run(
-                        command, env=environment, stdout=subprocess.PIPE, text=True, timeout=MOST_SECONDS
-                    )
-                    lines = done.stdout.splitlines()
-                except subprocess.TimeoutExpired as error:
-                    lines = (error.stdout or b"").decode().splitlines()
-            if lines:  # this process leaves the accelerator to the routes'
-                row = {"task": name, "route": route} | json.loads(lines[-1])
-                with open(given.into, "a") as file:
-                    file.write(json.dumps(row) + "\n")
-                print(row, flush=True)
+    for name, (route, switch) in itertools.product(() if given.page else given.tasks, ROUTES.items()):
+        keep({"task": name, "route": route}, ("experiments.native", "--route", name), switch, MOST_SECONDS, given.into)
     if given.into == RESULTS:
         write_page()
+
+
+def keep(route: dict[str, Any], command: Sequence[str], switch: str, limit: float, into: Path) -> None:
+    """Append a route and the last line that a module prints as JSON to a file, if it prints any within the limit [s].
+
+    It runs in a process of its own with an empty cache; this one leaves the accelerator to it.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {SWITCH: switch, "XDG_CACHE_HOME": folder}
+        command = [sys.executable, "-m", *command]
+        try:
+            done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, timeout=limit)
+            lines = done.stdout.splitlines()
+        except subprocess.TimeoutExpired as error:
+            lines = (error.stdout or b"").decode().splitlines()
+    if lines:
+        row = route | json.loads(lines[-1])
+        with open(into, "a") as file:
+            file.write(json.dumps(row) + "\n")
+        print(row, flush=True)
 
 
 def write_page() -> None:
@@ -114,17 +121,18 @@ def write_page() -> None:
             cells = [f"`{name}`"]
             for kind in KINDS:
                 own, other = (each[kind]["rate"] if kind in each else math.nan for each in (ours, theirs))
-                cells.append(" / ".join(map(_number, (own, other))) + f" = {own / other:.1f}")
+                cells.append(" / ".join(map(number, (own, other))) + f" = {own / other:.1f}")
             whole = (
                 sum(each[kind]["built"] for kind in KINDS) if len(each) == 3 else math.nan for each in (ours, theirs)
             )
-            lines.append([*cells, " / ".join(map(_number, whole))])
+            lines.append([*cells, " / ".join(map(number, whole))])
         header = ["task", *KINDS.values(), "building [s]"]
         tables[f"{route}, {platform}"] = markdown_table(lines, header).replace(" / - = nan", "").replace(" / -", "")
     write_tables(DOCS / "native.md", tables)
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
+    """Three digits; "-" for what is missing."""
     return "-" if math.isnan(value) else f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 

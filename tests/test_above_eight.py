@@ -1,6 +1,7 @@
 """Steps of more degrees of freedom than XLA unrolls, in native code: the engine's, with their derivatives."""
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from experiments.drop_in import MODELS
 from mjx_study.graph import operation, scalars
 from mjx_study.graph.build import known_libraries
 from mjx_study.graph.native import SWITCH, native_identity, native_summary
@@ -37,6 +39,9 @@ tolerance="1e-15"/><default><joint armature=".01" damping=".1"/><geom friction="
 BALL = """<mujoco><option timestep=".004" iterations="50" tolerance="1e-15"/><worldbody>
 <geom type="plane" size="1 1 .1" condim="1"/><body pos="0 0 .09"><joint type="slide" axis="0 0 1"/>
 <geom size=".1" condim="1" solimp=".5 .95 .1"/></body></worldbody></mujoco>"""
+FIELD = """<mujoco><option timestep=".004" iterations="50" ls_iterations="50" tolerance="1e-15"/>
+<asset><hfield name="h" nrow="9" ncol="8" size="1 1 .2 .1" elevation="{}"/></asset>
+<worldbody><geom type="hfield" hfield="h"/><body><freejoint/><geom size=".15" mass="1"/></body></worldbody></mujoco>"""
 SAMPLES = 11
 
 
@@ -228,10 +233,46 @@ def test_second_derivatives_of_large_maps_are_those_of_jax(
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+def test_a_ball_on_a_height_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values and gradients are those through XLA, all over the field and beyond its edges, in and out of contact.
+
+    But for a few samples: where the contacts of several prisms coincide, rounding decides how many of them MJX counts.
+    """
+    draw = np.random.default_rng(0)
+    host = mujoco.MjModel.from_xml_string(FIELD.format(" ".join(map(str, draw.uniform(size=72).round(3)))))
+    model, data = mjx.put_model(host), mjx.make_data(host)
+    qpos = np.zeros((200, 7))
+    qpos[:, :3], qpos[:, 3] = draw.uniform((-1.4, -1.4, 0), (1.4, 1.4, 0.4), (200, 3)), 1
+
+    def speed(qpos):
+        qvel = step(model, data.replace(qpos=qpos)).qvel
+        return jnp.sum(qvel**2), qvel
+
+    found = []
+    for switch in "10":
+        monkeypatch.setenv(SWITCH, switch)
+        found.append(jax.jit(jax.vmap(jax.value_and_grad(speed, has_aux=True)))(qpos))
+    ((_, qvel), slopes), ((_, expected), expected_slopes) = found
+    touching = np.abs(expected[:, 2] + 9.81 * host.opt.timestep) > 1e-9
+    assert 20 < np.sum(touching) < 180
+    same = np.max(np.abs(qvel - expected), axis=1) < 1e-10 * np.max(np.abs(expected))
+    assert np.mean(same[touching]) > 0.9 and np.all(same[~touching])
+    scale = np.max(np.abs(expected_slopes))
+    np.testing.assert_allclose(slopes[same], expected_slopes[same], rtol=0, atol=1e-8 * scale)
+
+
+def quadruped_of_mjx() -> Scene:
+    """MJX's `barkour_v0` on its height field, with a budget of the solver that does not end it."""
+    host = mujoco.MjModel.from_xml_path(str(MODELS["`barkour_v0`, a quadruped"]))
+    host.opt.iterations, host.opt.ls_iterations = 100, 50
+    return put_scene(host, "barkour_v0")
+
+
 @pytest.mark.slow
-def test_a_quadrupeds_steps_are_those_of_mjxs_arrays() -> None:
+@pytest.mark.parametrize("load", [partial(load_scene, "quadruped"), quadruped_of_mjx])
+def test_a_quadrupeds_steps_are_those_of_mjxs_arrays(load: Callable[[], Scene]) -> None:
     """Values and adjoints to rounding, in and out of contact, against JAX's operations with the same solver."""
-    scene = load_scene("quadruped")
+    scene = load()
     point, draw = states(scene.host, 64), np.random.default_rng(1)
     adjoints = [draw.normal(size=each.shape) for each in point[:2]]
 

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 
 from mjx_study.graph import scalars
+from mjx_study.graph.c import source_of
+from mjx_study.graph.function import capture
+from mjx_study.graph.indexing import FEWEST_ROWS
 from mjx_study.graph.native import SWITCH
 from mjx_study.graph.scalars import traced_part, unrolled
 
 TABLE = np.arange(12.0).reshape(4, 3) - 5
 ROW = np.array([0.3, -1.2, 2.5])
+FIELD = np.sin(np.arange(300.0)).reshape(20, 15)
 
 
 def _newton_root(x):
@@ -70,6 +74,7 @@ FUNCTIONS = {
     "known index": lambda x: jnp.outer(x, x)[jnp.array([2, 0, 2]), 1],
     "computed index": lambda x: jnp.asarray(TABLE)[jnp.argmax(x)] * x[jnp.argmin(x)],
     "several computed indices": lambda x: jnp.asarray(TABLE)[jnp.argsort(x)] @ x,
+    "computed index beyond an end": lambda x: jnp.stack([x, x[::-1]], 1)[jnp.floor(4 * x).astype(int)],
     "index beyond the end": lambda x: jnp.take(x, jnp.array([1, 7]), mode="clip"),
     "add to one place twice": lambda x: jnp.zeros((3, 3)).at[jnp.array([0, 2, 0])].add(x[:, None]).at[1, 2].set(x[0]),
     "set beyond the end": lambda x: x.at[jnp.array([1, 9])].set(4.0),
@@ -104,6 +109,25 @@ FUNCTIONS = {
 }  # fmt: skip
 
 
+def _looked_up(x):
+    """Entries, rows and blocks of large constant arrays at computed indices, some beyond an end."""
+    i, j = (jnp.floor(4 * each).astype(int) for each in (x[0], x[1] * x[2]))
+    field, whole = jnp.asarray(FIELD), jnp.asarray(np.floor(9 * FIELD).astype(np.int16))
+    tall = jnp.asarray(np.tile(FIELD, (5, 1)))
+    return (
+        field[i, j] + field[j + 1, 2],
+        field.at[i, j].get(mode="fill", fill_value=7.0),
+        jnp.take(field, j, mode="clip"),
+        tall[i] * x[0],
+        whole[jnp.stack([i, j]), 3],
+        jax.lax.dynamic_slice(tall, (j, i), (2, 3)),
+        field[i][j] > field[j, i],
+    )
+
+
+FUNCTIONS["computed indices of large arrays"] = _looked_up
+
+
 @pytest.mark.parametrize("native", [pytest.param("1", id="native"), pytest.param("0", id="operations")])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_the_value_is_the_functions(name, native, monkeypatch):
@@ -123,6 +147,7 @@ def test_the_value_is_the_functions(name, native, monkeypatch):
     [
         "elementwise",
         "computed index",
+        "computed indices of large arrays",
         "add to one place twice",
         "products",
         "products of what is computed",
@@ -182,6 +207,19 @@ def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped(monkeypa
 
     operations = _operations(lambda x: unrolled(function, x), ROW)
     assert sorted(operations) == ["add", "mul", "neg", "sin"]
+
+
+def test_large_constant_arrays_are_tables():
+    """At least `FEWEST_ROWS` possible values; one definition for all that read an array."""
+    row = jax.ShapeDtypeStruct((3,), float)
+
+    def looked_up(size, x):
+        array, places = jnp.sin(jnp.arange(size)), jnp.floor(x).astype(int)
+        return array[places[0]] * array[places[1:]]
+
+    for size, tables in ((FEWEST_ROWS - 1, 0), (FEWEST_ROWS, 1)):
+        source = source_of(capture(partial(looked_up, size), row, most=2000))
+        assert source.count("\nCONSTANTS(") == tables and source.count(" = TABLE(") == 3 * tables
 
 
 def test_what_does_not_change_in_a_loop_is_computed_before_it(monkeypatch):

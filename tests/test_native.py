@@ -17,7 +17,7 @@ from jax import lax
 
 from mjx_study import runtime
 from mjx_study.choices import TASK_DESCRIPTIONS
-from mjx_study.graph import build, c, native, random
+from mjx_study.graph import build, c, cuda, native, random
 from mjx_study.graph.function import capture
 from mjx_study.graph.native import SWITCH, computes_steps, native_identity
 from mjx_study.graph.nodes import ELEMENTWISE
@@ -152,7 +152,7 @@ def test_operations_of_integers(name, kind):
 @pytest.mark.parametrize("name", ["loops", "several computed indices", "whole arrays", "computed slice"])
 @pytest.mark.parametrize("most", [10, 60])
 def test_long_functions_are_divided(monkeypatch, name, most):
-    monkeypatch.setitem(c.MOST_TOGETHER, "cpu", most)
+    monkeypatch.setitem(c.MOST_TOGETHER, "cpu", (most, most))
     points = np.random.default_rng(0).normal(size=(9, 3))
     compare(lambda x: jax.tree.map(lambda leaf: leaf + most, FUNCTIONS[name](x)), points)
 
@@ -318,6 +318,24 @@ def test_long_sources_are_built_quickly(monkeypatch, folder):
     assert build.library_ready(build.build_library(source)) and {*build.QUICKLY} <= {*commands[-1]}
 
 
+@pytest.mark.skipif(cuda.nvrtc() is None, reason="there is no NVRTC")
+@pytest.mark.parametrize("most", [100, 100_000])
+def test_kernels_are_compiled_without_a_gpu(monkeypatch, most):
+    """Short ones and long ones, also by an NVRTC that does not know the options, into code for the architecture."""
+    point = jax.ShapeDtypeStruct((3,), float)
+    monkeypatch.setitem(c.MOST_TOGETHER, "gpu", (20, most))
+    source = c.source_of(capture(FUNCTIONS["loops"], point, most=999), "gpu")
+    assert source.count("\nAPART void part") > 1
+    kernels = [cuda.compile_kernel(source, "sm_90")]
+    monkeypatch.setattr(cuda, "MOST_OPTIMISED", 0)
+    kernels.append(cuda.compile_kernel(source, "sm_90"))
+    monkeypatch.setattr(cuda, "QUICKLY", ("--no-such-option",))
+    kernels.append(cuda.compile_kernel(source, "sm_90"))
+    assert all(each.startswith(b"\x7fELF") and b"kernel" in each for each in kernels) and len({*kernels}) == 3
+    with pytest.raises(ValueError, match='"x1" is undefined'):
+        cuda.compile_kernel(source.replace("x1 ", "nothing ", 1), "sm_90")
+
+
 def test_processes_build_at_once(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     running = [
@@ -336,7 +354,7 @@ def test_the_page_shows_what_is_written():
     names: dict[str, Any] = {"jnp": jnp}
     exec(python, names)
     written = c.source_of(capture(names["push"], jax.ShapeDtypeStruct((2,), float), most=99))
-    assert f"{{\n{shown}}}\n" in written
+    assert f"{{ ENTER\n{shown}}}\n" in written
 
 
 @pytest.mark.parametrize(

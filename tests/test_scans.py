@@ -100,7 +100,7 @@ def in_a_batch(function):
 @pytest.mark.parametrize("most", [10, 60, 500])
 @pytest.mark.parametrize("name", LOOPS)
 def test_loops(monkeypatch, name, most):
-    monkeypatch.setitem(c.MOST_TOGETHER, "cpu", most)
+    monkeypatch.setitem(c.MOST_TOGETHER, "cpu", (most, most))
     program = in_a_batch(with_native_scans(LOOPS[name]))
     traced = str(jax.make_jaxpr(program)(FIXED, STARTS, ROWS))
     assert "native[" in traced and "scan[" not in traced

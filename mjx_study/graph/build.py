@@ -71,7 +71,9 @@ def build_identity(in_numpy: bool = False) -> str:
     """Digest of what libraries, or sources that NumPy runs, depend on besides their source."""
     if in_numpy:
         return _digest(sys.version, version_of("numpy"), version_of("jaxlib"))
-    return _digest(compiler(), QUICKLY, WELL, _FLAGS_HERE, processor(), cuda.target(), version_of("jaxlib"))
+    return _digest(
+        compiler(), QUICKLY, WELL, _FLAGS_HERE, processor(), cuda.target(), cuda.QUICKLY, version_of("jaxlib")
+    )
 
 
 _FLAGS_HERE: Final = ("-mcpu=native" if os.uname().machine in ("arm64", "aarch64") else "-march=native", *FLAGS)
@@ -133,9 +135,9 @@ def _build(name: str, source: str) -> Any:
         command, _ = compiler() or (("cc",), "")
         include = f"-I{jax.ffi.include_dir()}"
         with elsewhere():
-            if cuda.target() is not None:
+            if (target := cuda.target()) is not None:
                 try:
-                    Path(folder, "kernel").write_bytes(cuda.compile_kernel(source))
+                    Path(folder, "kernel").write_bytes(cuda.compile_kernel(source, target.split()[1]))
                 except ValueError as error:
                     return _failed(written, "NVRTC", str(error))
             flags = *(WELL if len(source) < LONG else QUICKLY), *_FLAGS_HERE

@@ -35,8 +35,9 @@ NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for na
 
 MAX_ARGUMENT: Final = 4000
 """Maximum size of a kernel's argument [bytes]."""
-MOST_TOGETHER: Final = {"cpu": 500, "gpu": 20_000}
-"""Maximum number of statements in a function; compilers allocate registers in more than linear time."""
+MOST_TOGETHER: Final = {"cpu": (500, 500), "gpu": (5_000, 20_000)}
+"""Maximum numbers of lines in a function and in a loop that stays in one; compilers allocate registers in more than
+linear time."""
 
 
 class NotWrittenError(Exception):
@@ -56,9 +57,9 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
     """
     writer = Writer(function)
     statements, forms_in, forms_out = writer.written(passes)
-    functions, num_kept = in_parts(statements, writer.loads, MOST_TOGETHER[platform])
+    functions, num_kept = in_parts(statements, writer.loads, *MOST_TOGETHER[platform])
     if platform == "gpu":
-        kernel = [_text("prelude.cu"), _text("functions.c"), *functions, _text("kernel.cu")]
+        kernel = [_text("prelude.cu"), _text("functions.c"), *writer.tables, *functions, _text("kernel.cu")]
         parts = ["#ifdef __CUDACC_RTC__", *kernel, "#else", _text("launcher.c"), "#endif"]
         return "\n".join([_batch(forms_in, forms_out), f"#define KEPT {num_kept}", *parts, ""])
     wide = any(dtype.itemsize == 8 for dtype in writer.dtypes)
@@ -71,6 +72,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
             f"#define KEPT {num_kept}",
             _text("prelude.c"),
             _text("functions.c"),
+            *writer.tables,
             *functions,
             _text("handler.c"),
         ]
@@ -117,14 +119,18 @@ def _type(dtype: Any) -> str:
 
 @no_type_check
 def _constant(value: Any) -> str:
-    kind, value = _type(value.dtype), value.item()
+    kind = _type(value.dtype)
+    return f"ALL({kind}, {_literal(kind, value.item())})"
+
+
+def _literal(kind: str, value: Any) -> str:
     if kind == "mask":
-        return f"ALL(mask, {-int(value)})"
+        return str(-int(value))
     if isinstance(value, int):
-        return f"ALL({kind}, {value + 1} - 1)" if value < 0 else f"ALL({kind}, {value}{'u' if kind[0] == 'u' else ''})"
+        return f"{value + 1} - 1" if value < 0 else f"{value}{'u' if kind[0] == 'u' else ''}"
     if math.isfinite(value):
-        return f"ALL({kind}, {value!r}{'f' if kind == 'f32' else ''})"
-    return f"ALL({kind}, {'NAN' if math.isnan(value) else 'INFINITY' if value > 0 else '-INFINITY'})"
+        return f"{value!r}{'f' if kind == 'f32' else ''}"
+    return "NAN" if math.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
 
 
 @no_type_check
@@ -144,6 +150,15 @@ class Writer:
         self._places: dict[int, tuple[int, int]] = {}
         self._uses: set[int] = set()
         self._before: list[str] = []
+        self.constant_vectors: dict[tuple[str, tuple[Any, ...]], str] = {}
+
+    @property
+    def tables(self) -> list[str]:
+        """Definitions of the constant vectors that the statements read at computed indices."""
+        return [
+            f"CONSTANTS({kind}) {name}[] = {{{', '.join(_literal(kind, each) for each in entries)}}};"
+            for (kind, entries), name in self.constant_vectors.items()
+        ]
 
     def written(self, passes: Passes | None) -> tuple[list[Statement | Loop], Forms, Forms]:
         """All statements, and the forms of the inputs and outputs of the function, or of its passes."""
@@ -254,6 +269,14 @@ class Writer:
                     (place, at), kind = self._places[first.number], _type(node.dtype)
                     where = f"{place}, {at} + {node.parameters} * {self._value(index)}"
                     line = f"{kind} x{node.number} = ENTRY({kind}, {where});"
+                    found.append(self._statement([line], {node.number: kind}))
+                case "table":
+                    kind, (index,) = _type(node.dtype), node.arguments
+                    table = self.constant_vectors.setdefault(
+                        (kind, tuple(node.parameters.tolist())), f"table{len(self.constant_vectors)}"
+                    )
+                    line = f"{kind} x{node.number} = TABLE({kind}, {table}, {self._value(index)});"
+                    self.dtypes.add(node.dtype)
                     found.append(self._statement([line], {node.number: kind}))
                 case "whole":
                     raise NotWrittenError(node.parameters[0].primitive.name)

@@ -67,6 +67,8 @@ def _emit(nodes: Iterable[Node], values: dict[int, Any]) -> None:
             case "output":
                 place, index = node.parameters
                 found = arguments[0][place][index]
+            case "table":
+                found = jnp.asarray(node.parameters)[arguments[0]]
             case "whole":
                 equation, avals = node.parameters
                 left = iter(arguments)

@@ -14,7 +14,8 @@ from jax import lax
 from mjx_study.graph.nodes import Node, ScalarGraph, filled, no_type_check
 
 Arrays = list[np.ndarray]
-_CLIP: Final = lax.GatherScatterMode.CLIP
+FEWEST_ROWS: Final = 64
+"""Number of possible values of a computed index from which a constant array is a table in memory."""
 
 
 @no_type_check
@@ -49,6 +50,8 @@ def _dynamic_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: An
     index = _clipped(graph, [each[()] for each in starts], last)
     if (found := _in_memory(graph, array, aval, index, last)) is not None:
         return [found]
+    if (found := _looked_up(graph, _table(array), index, last, aval.shape)) is not None:
+        return [found.reshape(aval.shape)]
     for first, here in _cases(graph, index, last):
         result = _selected(graph, here, array[_window(first, aval.shape)], result, aval)
     return [result]
@@ -73,6 +76,33 @@ def _in_memory(
 
 
 @no_type_check
+def _table(array: np.ndarray) -> np.ndarray | None:
+    """An array as numbers; None if it is not constant, small, or of truth values."""
+    if array.size < FEWEST_ROWS or any(isinstance(each, Node) or each.dtype == bool for each in array.flat):
+        return None
+    return np.array(array.tolist(), array.flat[0].dtype)
+
+
+@no_type_check
+def _looked_up(
+    graph: ScalarGraph, table: np.ndarray | None, start: Sequence[Any], last: Sequence[Any], sizes: Sequence[int]
+) -> np.ndarray | None:
+    """Entries of a window that starts within bounds in a table, flat; None if it has few possible places."""
+    computed = [at for at in start if isinstance(at, Node)]
+    cases = math.prod(most + 1 for at, most in zip(start, last, strict=True) if isinstance(at, Node))
+    if table is None or not computed or cases < FEWEST_ROWS:
+        return None
+    kind, flat = computed[0].dtype, np.arange(table.size).reshape(table.shape)
+    add = lambda one, other: graph.scalar(lax.add_p, (one, kind.type(other)), kind)  # noqa: E731
+    first = kind.type(0)
+    for at, size in zip(start, table.shape, strict=True):
+        scaled = graph.scalar(lax.mul_p, (first, kind.type(size)), kind)
+        first = graph.scalar(lax.add_p, (scaled, at if isinstance(at, Node) else kind.type(at)), kind)
+    places = [add(first, offset) for offset in flat[_window([0] * flat.ndim, sizes)].flat]
+    return filled((len(places),), [graph.looked_up(table, each) for each in places])
+
+
+@no_type_check
 def _dynamic_update_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     array, update, *starts = inputs
     last = [whole - size for whole, size in zip(array.shape, update.shape, strict=True)]
@@ -92,8 +122,8 @@ def _window(first: Any, sizes: Any) -> tuple[slice, ...]:
 class _Windows:
     """Where a gather reads or a scatter writes in an array of a shape."""
 
-    def __init__(self, graph: ScalarGraph, shape: Sequence[int], sizes: Sequence[int], numbers: Any, mode: Any):
-        self._graph, self._sizes, self._numbers, self._clip = graph, sizes, numbers, mode == _CLIP
+    def __init__(self, graph: ScalarGraph, shape: Sequence[int], sizes: Sequence[int], numbers: Any, clip: bool):
+        self._graph, self._sizes, self._numbers, self._clip = graph, sizes, numbers, clip
         self._flat, self._last = np.arange(math.prod(shape)).reshape(shape), np.array(shape) - sizes
         dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
         self.kept = [size for dim, size in enumerate(sizes) if dim not in dropped]
@@ -111,6 +141,20 @@ class _Windows:
             inside = np.all((start >= 0) & (start <= self._last))
             yield self._flat[_window(start, self._sizes)].reshape(-1) if inside else None, here
 
+    def looked_up(self, table: np.ndarray | None, indices: np.ndarray, at: tuple[int, ...]) -> tuple[Any, Any]:
+        """The window's entries for one vector of indices by `_looked_up`, and whether it is within bounds."""
+        numbers, last = self._numbers, [self._last[dim] for dim in self._numbers.start_index_map]
+        given = indices[at]
+        kept, inside, start = _clipped(self._graph, given, last), np.bool_(True), [0] * self._flat.ndim
+        for dim, batched in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
+            start[dim] = at[batched]
+        for dim, index, within in zip(numbers.start_index_map, given, kept, strict=True):
+            start[dim] = within
+            if not self._clip:
+                same = self._graph.scalar(lax.eq_p, (index, within), np.dtype(bool))
+                inside = self._graph.scalar(lax.and_p, (inside, same), np.dtype(bool))
+        return _looked_up(self._graph, table, start, self._last.tolist(), self._sizes), inside
+
 
 @no_type_check
 def _gather(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
@@ -120,18 +164,24 @@ def _gather(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> A
         fill = (
             np.nan if np.issubdtype(aval.dtype, np.inexact) else np.iinfo(aval.dtype).min if aval.dtype != bool else 1
         )
-    windows = _Windows(graph, array.shape, parameters["slice_sizes"], numbers, parameters["mode"])
+    clip = parameters["mode"] != lax.GatherScatterMode.FILL_OR_DROP  # XLA also clips what is promised to be in bounds
+    windows = _Windows(graph, array.shape, parameters["slice_sizes"], numbers, clip)
     outside = filled(
         (math.prod(windows.kept),), itertools.repeat(np.asarray(fill, aval.dtype)[()], math.prod(windows.kept))
     )
     batch, pool = indices.shape[:-1], array.reshape(-1)
     found = np.empty((*batch, len(outside)), object)
+    table = _table(array)
     for at in np.ndindex(*batch):
         row = outside
+        entries, inside = windows.looked_up(table, indices, at)
+        if entries is not None:
+            found[at] = _selected(graph, inside, entries, row, aval)
+            continue
         for places, here in windows.cases(indices, at):
             row = row if places is None else _selected(graph, here, pool[places], row, aval)
         found[at] = row
-    found = found.reshape(*batch, *windows.kept)
+    found = found.reshape((*batch, *windows.kept))
     return [np.moveaxis(found, range(len(batch), found.ndim), numbers.offset_dims)]
 
 
@@ -150,7 +200,7 @@ def _scatter(combine: Any) -> Any:
         sizes = iter(updates.shape[dim] for dim in numbers.offset_dims)
         dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
         sizes = [1 if dim in dropped else next(sizes) for dim in range(array.ndim)]
-        windows = _Windows(graph, array.shape, sizes, numbers, parameters["mode"])
+        windows = _Windows(graph, array.shape, sizes, numbers, parameters["mode"] == lax.GatherScatterMode.CLIP)
         batch = indices.shape[:-1]
         moved = np.moveaxis(updates, numbers.offset_dims, range(len(batch), updates.ndim))
         rows = moved.reshape(*batch, math.prod(windows.kept))

@@ -63,8 +63,9 @@ class Node:
     """A scalar that depends on the inputs: an operation, with nodes and NumPy scalars as arguments.
 
     `operation` is a JAX primitive or "input", "carry" (of a loop), "whole" (an operation on whole arrays), "loop",
-    "output" (an entry of the result of one of the last two, its only argument), or "entry" (of an input at a computed
-    index; the parameter is how far its entries are apart, the first of them an argument). Arguments have lower numbers.
+    "output" (an entry of the result of one of the last two, its only argument), "entry" (of an input at a computed
+    index; the parameter is how far its entries are apart, the first of them an argument), or "table" (entry of a
+    constant vector, the parameter, at a computed index). Arguments have lower numbers.
     """
 
     __slots__ = ("arguments", "dtype", "number", "operation", "parameters")
@@ -196,6 +197,13 @@ class ScalarGraph:
             return None
         apart = {after - before for before, after in itertools.pairwise(numbers)}
         return self.node("entry", (index, cases[0]), apart.pop(), cases[0].dtype) if len(apart) == 1 else None
+
+    def looked_up(self, table: np.ndarray, index: Node) -> Node:
+        """Entry of a constant vector at a computed index within it."""
+        key = "table", index.number, id(table)
+        if key not in self._known:
+            self._known[key] = self.node("table", (index,), table.reshape(-1), table.dtype)
+        return self._known[key]
 
     def reduced(self, primitive: Any, rows: np.ndarray, aval: Any) -> np.ndarray:
         """Combine entries along the last axis; an empty axis gives zeros."""

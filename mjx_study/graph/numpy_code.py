@@ -46,7 +46,8 @@ def python_source(function: ScalarFunction, passes: Passes | None = None) -> str
     lines = [*map(text.python, writer.loads.values()), *text.lines(items)]
     forms = [[(size, np.dtype(kind).name, rank) for size, kind, rank in each] for each in (inputs, outputs)]
     head = [BEGINNING, f"INPUTS, OUTPUTS = {forms[0]}, {forms[1]}"]
-    known = (f"{name} = {value}" for value, name in text.constants.items())
+    known = [f"{name} = {value}" for value, name in text.constants.items()]
+    known += [f"{name} = array({list(entries)}, {kind})" for (kind, entries), name in writer.constant_vectors.items()]
     return "\n".join([*head, *known, *text.loops, "def samples(i, o, lanes):", *_indented(lines), " pass", ""])
 
 
@@ -112,6 +113,7 @@ class _Text:
         line = re.sub(r"MASK(?=\()", "", line)
         line = re.sub(r"^\w+ (?=(x|next)[\d_]+ = )", "", line)
         line = re.sub(r"\bENTRY\(\w+, (\d+), (.*)\)$", r"i[\1][\2, lanes * (i[\1].shape[1] > 1)]", line)
+        line = re.sub(r"\bTABLE\(\w+, (\w+), (.*)\)$", r"\1[\2]", line)
         line = re.sub(r"\bLOAD(?:_BOOL)?\((?:\w+, )?(\d+), ([^,]*)\)$", r"i[\1][\2]", line)
         return re.sub(r"^STORE(?:_BOOL)?\((?:[a-z]\w*, )?(\d+), ([^,]*), (.*)\)$", r"o[\1][\2] = \3", line)
 
@@ -190,7 +192,7 @@ def _names() -> dict[str, Any]:
             names |= {f"{short}_of_f64": _saturated(kind), f"{short}_of_f32": _saturated(kind)}
     names |= {"AS": lambda kind, value: np.asarray(value).astype(kind), "any": np.any}
     names |= {"BITS": lambda kind, value: np.asarray(value).view(kind), "LOOP": _looped}
-    return names | {"INFINITY": math.inf, "NAN": math.nan}
+    return names | {"INFINITY": math.inf, "NAN": math.nan, "inf": math.inf, "nan": math.nan, "array": np.array}
 
 
 class Library:

@@ -56,25 +56,30 @@ class Loop:
         return Statement(text, uses.difference(self.loads), assigned, sum(each.size for each in inside))
 
 
-def in_parts(items: Iterable[Statement | Loop], loads: Mapping[int, str], most: int) -> tuple[list[str], int]:
-    """Write functions of at most about `most` lines, the last of which, `samples`, calls the others.
+def in_parts(
+    items: Iterable[Statement | Loop], loads: Mapping[int, str], most: int, most_of_loop: int
+) -> tuple[list[str], int]:
+    """Write functions, the last of which, `samples`, calls the others.
 
     Args:
         loads: declarations of variables that any function may repeat, by number.
+        most: number of lines of a function at most, about.
+        most_of_loop: number of lines up to which a loop is not divided.
 
     Returns:
         The functions, and how many values they keep in memory.
     """
-    parts = _Parts(loads, most)
+    parts = _Parts(loads, most, most_of_loop)
     parts.place(items)
     parts.close()
     return parts.written()
 
 
 class _Parts:
-    def __init__(self, loads: Mapping[int, str], most: int):
-        self._loads, self._most = dict(loads), most
+    def __init__(self, loads: Mapping[int, str], most: int, most_of_loop: int):
+        self._loads, self._most, self._most_of_loop = dict(loads), most, most_of_loop
         self._open: list[Statement] = []
+        self._size = 0  # of what is open [lines]
         self._parts: list[list[Statement]] = []
         self._driver: list[str | int] = []  # lines, and numbers of masks that end a loop
         self._loops: list[tuple[int, int]] = []  # first and last part
@@ -82,12 +87,13 @@ class _Parts:
     def place(self, items: Iterable[Statement | Loop]) -> None:
         for item in items:
             statement = item.together() if isinstance(item, Loop) else item
-            if isinstance(item, Loop) and statement.size > self._most:
+            if isinstance(item, Loop) and statement.size > self._most_of_loop:
                 self._divide(item)
                 continue
-            if sum(each.size for each in self._open) + statement.size > self._most:
+            if self._size + statement.size > self._most:
                 self.close()
             self._open.append(statement)
+            self._size += statement.size
 
     def _divide(self, loop: Loop) -> None:
         self.close()
@@ -107,7 +113,7 @@ class _Parts:
         if self._open:
             self._driver.append(f"part{len(self._parts)}(PASSED);")
             self._parts.append(self._open)
-            self._open = []
+            self._open, self._size = [], 0
 
     def written(self) -> tuple[list[str], int]:
         kinds = {at: kind for part in self._parts for each in part for at, kind in each.defines.items()}
@@ -124,7 +130,7 @@ class _Parts:
             functions.append(
                 "\n".join(
                     [
-                        f"APART void part{place}(ARGUMENTS) {{",
+                        f"APART void part{place}(ARGUMENTS) {{ ENTER",
                         *recalled,
                         *(each.text for each in part),
                         *(f"KEEP({kinds[at]}, {slots[at]}, x{at});" for at in changed),

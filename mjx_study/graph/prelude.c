@@ -22,6 +22,7 @@
 #define PART static
 #define ARGUMENTS const char *const *in, const long *in_step, char *const *out, const long *out_step, char *kept, \
                   long step
+#define ENTER
 #define PASSED in, in_step, out, out_step, kept, step
 
 #define VECTOR_OF(name, scalar)                                      \
@@ -86,6 +87,13 @@ SELECT(u8, i8)
     EACH memcpy((char *)&r + lane * sizeof(r[0]), in[place] + (at)[lane] * in_step[place] + lane * sizeof(r[0]),       \
                 sizeof(r[0]));                                                                                       \
     r;                                                                                                               \
+  })
+#define CONSTANTS(type) static const __typeof__(((type){0})[0])
+#define TABLE(type, table, at)                      \
+  ({                                                \
+    type r;                                         \
+    EACH r[lane] = (table)[(at)[lane]];             \
+    r;                                              \
   })
 #define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
 #define STORE_BOOL(place, at, value) STORE(u8, place, at, AS(u8, (value) & 1))

@@ -20,10 +20,11 @@ typedef int mask;  // -1 or 0
 #define BITS(type, value) bits<type>(value)
 #define MASK(comparison) (-(mask)(comparison))
 #define ALL(type, constant) ((type)(constant))
-#define APART static __device__
+#define APART static __device__ __noinline__
 #define PART static __device__
 #define ARGUMENTS const struct batch &batch, const long lane, char *kept, long step
 #define PASSED batch, lane, kept, step
+#define ENTER __builtin_assume(__isLocal(kept));
 
 ONE int any(mask m) { return m; }
 
@@ -48,6 +49,8 @@ ONE mask select_bool(mask m, mask no, mask yes) { return m ? yes : no; }
 #define KEEP(type, slot, value) (*(type *)(kept + (slot) * 8) = (value))
 #define RECALL(type, slot) (*(const type *)(kept + (slot) * 8))
 #define ENTRY LOAD
+#define CONSTANTS(type) static __device__ const type
+#define TABLE(type, table, at) ((table)[at])
 #define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
 #define STORE_BOOL(place, at, value) STORE(u8, place, at, (value) & 1)
 
