@@ -203,7 +203,7 @@ def _known_step(scene: Scene, model: mjx.Model, point: Point, after: State) -> t
 
     def rule(primals: Any, changes: Any) -> Any:
         traced, point, after = primals
-        inputs = differentiated_once((traced, *point))
+        inputs = traced, *differentiated_once(point)
         return step(*primals), change_over(scene, whole, inputs, after.warmstart, (changes[0], *changes[1]))[1:3]
 
     step = with_rule(known, rule)
