@@ -192,7 +192,7 @@ def cost() -> None:
             ),
         }
         found, _, missed, *_ = np.asarray([call() for call in calls.values()][1].events).T
-        taken = interleaved(calls, 15, clock=time.process_time)
+        taken = interleaved(calls, 301, clock=time.process_time, limit=15)
         ratios.append(f"{np.median(taken['term']) / np.median(taken['plain']):.2f}")
         events.append(f"{np.mean(found):.1f}, {np.max(found):.0f}, {np.mean(missed):.1f}")
         print(ratios, events, flush=True)

@@ -29,6 +29,8 @@ Numbers = np.ndarray | Array | float
 DERIVATIVES: Final = ("exact", "smoothed", "none")
 SPREAD: Final = 0.02
 """Standard deviation of the logarithms by which predictions are smoothed."""
+_SLIDES_ONLY: Final = 2
+"""MuJoCo's mark of bodies on slides along axes alone, whose inverse weight is that of their mass alone."""
 DECREMENT: Final = 1e-3
 """A fit has converged if a full step would lower half the sum of squares by less: 0.04 standard errors away."""
 
@@ -158,6 +160,8 @@ def with_masses(model: mjx.Model, data: mjx.Data, mass: Float[Array, " nbody"]) 
         within[model.body_parentid[body]] |= within[body]
     for body in range(model.nbody):
         move, turn = (weight(jacobian) for jacobian in mjx.jac(model, data, data.xipos[body], jnp.array(body)))
+        if model.body_simple[body] == _SLIDES_ONLY:
+            move = 1 / mass[body]
         of_bodies.append(jnp.stack([move, turn]))
     of_dofs = jnp.diag(inverse)
     for kind, start in zip(model.jnt_type, model.jnt_dofadr, strict=True):

@@ -373,54 +373,6 @@ def test_an_environment_has_the_onset_term_inside_and_only_there() -> None:
         gradient(gap, None)
 
 
-@pytest.mark.parametrize(
-    ("law", "speed", "gap", "steps"),
-    [(Law(), -1.5, 0.0352, 80), pytest.param(BOUNCING, -1.0, 0.0349, 400, marks=pytest.mark.slow)],
-    ids=["begins", "begins and ends under force"],
-)
-def test_the_onset_term_over_the_model(law: Law, speed: float, gap: float, steps: int) -> None:
-    """Three symmetries hold to rounding, with the term and without, in both modes: of a shift of ball or floor, of the
-    unit of time, and of the unit of mass."""
-    scene = scene_of(FALLING)
-    model, start = apply_contact(scene.model, law.contact), scene.template
-    shift: dict[str, float] = {"gap": 1.0, "radius": -1.0, "floor": -1.0}
-    time: dict[str, float] = {"timestep": 1.0, "timeconst": 1.0, "speed": -1.0, "gravity": -2.0}
-    mass: dict[str, float] = {"mass": 1.0, "weight": -1.0}
-
-    def height(changes: dict[str, Any], onset: str) -> Any:
-        c = {name: jnp.asarray(changes.get(name, 0.0)) for name in (*shift, *time, *mass)}
-        option = model.opt.replace(
-            timestep=model.opt.timestep * (1 + c["timestep"]), gravity=model.opt.gravity * (1 + c["gravity"])
-        )
-        changed = model.replace(
-            opt=option,
-            geom_size=model.geom_size.at[1, 0].add(c["radius"]),
-            geom_pos=model.geom_pos.at[0, 2].add(c["floor"]),
-            geom_solref=model.geom_solref.at[:, 0].multiply(1 + c["timeconst"]),
-            body_mass=model.body_mass * (1 + c["mass"]),
-            body_invweight0=model.body_invweight0 * (1 + c["weight"]),
-        )
-        data = start.replace(qpos=gap + c["gap"][None], qvel=jnp.array([speed]) * (1 + c["speed"]))
-        return jax.lax.scan(lambda data, _: (step(changed, data, onset=onset), None), data, length=steps)[0].qpos[0]
-
-    def slopes(point: Any) -> Any:
-        return [jacobian(partial(height, onset=onset))(point)
-                for onset in ("none", "linear") for jacobian in (jax.grad, jax.jacfwd)]  # fmt: skip
-
-    point = dict.fromkeys([*shift, *time, *mass], jnp.array(0.0))
-    plain, _, reverse, forward = compiled(slopes, point)(point)
-    for found in (plain, reverse):
-        along = [sum(rate * found[name] for name, rate in each.items()) for each in (time, mass)]
-        scale = max(abs(float(found[name])) for name in time)
-        np.testing.assert_allclose(along, 0, atol=1e-9 * scale)
-        # where ball and floor are, the height is the gap's less than it by the shift
-        np.testing.assert_allclose([found["radius"], found["floor"]], 1 - found["gap"], rtol=1e-9)
-    for name in point:
-        np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-12)
-    assert all(abs(reverse[name] - plain[name]) > 0.1 for name in ("gap", "radius", "floor"))
-    assert min(abs(float(reverse[name])) for name in (*time, *mass)) > 1e-6
-
-
 def test_the_onset_term_is_of_first_order() -> None:
     model, data = device(FALLING)
     with pytest.raises(ValueError, match="unknown onset of a step 'smooth'; choose from none, linear"):

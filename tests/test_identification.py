@@ -51,15 +51,17 @@ def test_products_leave_their_factors_unknown() -> None:
 
 
 def test_what_depends_on_masses_is_mujocos() -> None:
-    """Free, ball and hinge joints, a static body and a tendon, against `mj_setConst`."""
+    """Free, ball, hinge and slide joints, a static body and a tendon, against `mj_setConst`."""
     engine = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><geom size=".1" mass="1"/></body>
+      <body pos="0 3 0"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+        <geom size=".1" mass="3"/></body>
       <body pos="0 0 1"><freejoint/><geom type="box" size=".1 .2 .3" pos=".1 0 0" mass="2"/>
         <body pos=".3 0 0"><joint type="ball"/><geom type="capsule" size=".05 .1" mass="1"/>
           <body pos="0 .3 0"><joint name="h" type="hinge" axis="1 0 0"/>
             <geom type="capsule" size=".05 .1" mass=".5" pos="0 0 .2"/></body>
       </body></body></worldbody><tendon><fixed><joint joint="h" coef="2"/></fixed></tendon></mujoco>""")
     model, data = mjx.put_model(engine), mjx.make_data(engine)
-    factor = np.array([1, 1, 0.5, 2, 3])
+    factor = np.array([1, 1, 3, 0.5, 2, 3])
     found = jax.jit(with_masses)(model, data, jnp.asarray(engine.body_mass * factor))
     engine.body_mass[:] *= factor
     engine.body_inertia[:] *= factor[:, None]

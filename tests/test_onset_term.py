@@ -390,12 +390,3 @@ def test_a_batch_says_what_the_term_met() -> None:
 def test_what_has_no_meaning_is_refused() -> None:
     with pytest.raises(ValueError, match="unknown onset 'exact'; choose from none, linear, jump"):
         check_onset("exact")
-    scene = scene_of(floor_scene(BODY, option(2e-3, "", ""), 'condim="1"'))
-    start = initial_state(scene)
-
-    def over_model(solref):
-        model = apply_contact(scene.model, ContactModel(solref, DEFAULT.contact.solimp))
-        return corrected_rollout(scene, model, start, lambda index, state: jnp.zeros(0), 2)[0].qpos[-1, 0]
-
-    with pytest.raises(TypeError, match="not over the model"):
-        jax.grad(over_model)(DEFAULT.contact.solref)

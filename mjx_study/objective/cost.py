@@ -1,7 +1,10 @@
 """The cost of one rollout as a pure function, for tracing and differentiation."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, Key
 
 from estimators.noise import split_sample_key, standard_noise
@@ -61,9 +64,17 @@ def rollout_cost(
     if onset == "jump":
         fixed, each = jax.lax.stop_gradient((theta, feedforward))
         law = lambda index, state: control_law(each[index], state, fixed)  # noqa: E731
-        term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, running_cost, final_cost)
+        costs_to_go = _with_fixed_model(task).costs(without_derivative(contact))
+        term, counts = jump_term(task.scene, model, states, controls, law, *costs_to_go)
     cost = jnp.sum(costs) + final_cost(last)
     return cost + term, (states, controls, jnp.max(residuals), counts)
+
+
+def _with_fixed_model(task: Task) -> Task:
+    """The task, its scene without derivatives over the model."""
+    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(task.scene.model)):
+        return task
+    return task.replace(scene=dataclasses.replace(task.scene, model=without_derivative(task.scene.model)))
 
 
 def derivative_model(task: Task, contact: ContactModel | None) -> mjx.Model | None:

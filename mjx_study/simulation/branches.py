@@ -27,7 +27,8 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Scalar
 from mjx_study.simulation.dynamics import Control, ControlLaw, Controls, State, solved_step, step, with_solver
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import Passages, least_travel, passages
+from mjx_study.simulation.onset import Passages, least_travel, passages, timestep_of, without_derivative
+from mjx_study.simulation.over_model import moved_by_model
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Events, OnsetCounts, Past, at_touch, changes, events_of
 
@@ -46,17 +47,20 @@ def jump_term(
     final_cost: Callable[[State], Scalar],
     slots: int = SLOTS,
 ) -> tuple[Scalar, OnsetCounts]:
-    """Return zero, with the onset term as its derivative with respect to whatever the states depend on.
+    """Return zero, with the onset term as its derivative with respect to the model and whatever the states depend on.
 
     Args:
+        model: the model that was stepped, which may have derivatives.
         states: states from `dynamics.rollout`, `(horizon + 1, ...)`, with their derivatives.
         control_law: control law of the rollout, independent of the differentiated inputs.
-        running_cost, final_cost: as in `tasks.Task`.
+        running_cost, final_cost: as in `tasks.Task`, likewise.
         slots: maximum number of events to correct, earliest first.
     """
     before, controls = jax.lax.stop_gradient((jax.tree.map(lambda leaf: leaf[:-1], states), controls))
     if not guards.num_guards(scene.template):
         return jnp.zeros_like(before.qpos, shape=()), OnsetCounts.none(before.qpos.dtype)
+    moving_model, model = model, without_derivative(model)
+    timestep = timestep_of(scene, model)
 
     def cost_to_go(index, state):
         def advance(carry):
@@ -71,11 +75,11 @@ def jump_term(
 
     course = jax.vmap(lambda state, control: solved_step(scene, model, state, control)[-1])(before, controls)
     past = Past.none(jax.tree.map(lambda leaf: leaf[0], course))
-    past, found = jax.lax.scan(lambda past, here: changes(here, past, scene.timestep), past, course)
+    past, found = jax.lax.scan(lambda past, here: changes(here, past, timestep), past, course)
     events = events_of(found, slots)
     slots = len(events.used)
     filled = jnp.sum(events.used)
-    weights = jnp.zeros((slots, 2, scene.host.nv), before.qpos.dtype)
+    weights, normals = jnp.zeros((slots, 2), before.qpos.dtype), jnp.zeros((slots, scene.host.nv), before.qpos.dtype)
     flags, rates = jnp.zeros((slots, 2), bool), jnp.zeros(slots, before.qpos.dtype)
 
     def fill(carry):
@@ -85,24 +89,25 @@ def jump_term(
         return slot + 1, *(every.at[slot].set(one) for every, one in zip(found, own, strict=True))
 
     # not a scan: the loop over a batch ends with the last event of any rollout
-    start = jnp.zeros((), int), weights, flags, rates
-    _, weights, flags, rates = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, start)
-    chatters = events.chattering(rates, scene.timestep)
-    weights = jnp.where(chatters[:, None, None], 0.0, weights)
+    start = jnp.zeros((), int), weights, normals, flags, rates
+    _, weights, normals, flags, rates = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, start)
+    chatters = events.chattering(rates, timestep)
+    weights = jnp.where(chatters[:, None], 0.0, weights)
     at = jnp.stack([events.step, events.step - 1], axis=1)
     moved = jax.vmap(jax.vmap(lambda fixed, here: difference_position(scene.host, fixed, here)))(
         before.qpos[at], states.qpos[at]
     )
     narrow, valid = flags.T
-    return jnp.sum(weights * moved), events.counts(past, valid, narrow, jnp.zeros(slots, weights.dtype), chatters)
+    closer = jnp.einsum("ev,etv->et", normals, moved) + moved_by_model(scene, moving_model, before, events)[:, None]
+    return jnp.sum(weights * closer), events.counts(past, valid, narrow, jnp.zeros(slots, weights.dtype), chatters)
 
 
 def _weights(
     scene: Scene, model: mjx.Model, before: State, controls: Controls, cost_to_go: CostToGo, event: Events
-) -> tuple[Float[Array, "2 nv"], Bool[Array, " 2"], Scalar]:
-    """(1 - s) J_k n / D and s J_{k-1} n / D of one event; whether its cell is too narrow, and whether it is valid; and
+) -> tuple[Float[Array, " 2"], Float[Array, " nv"], Bool[Array, " 2"], Scalar]:
+    """(1 - s) J_k / D and s J_{k-1} / D of one event; n; whether its cell is too narrow, and whether it is valid; and
     its relaxation rate."""
-    host, timestep = scene.host, scene.timestep
+    host, timestep = scene.host, timestep_of(scene, model)
     qpos, qvel = before.qpos[event.step], before.qvel[event.step]
     touch = with_solver(at_touch, model, scene.template, qpos, qvel, event)
     start = integrate_position(host, qpos, -qvel, timestep * touch.share)
@@ -121,6 +126,6 @@ def _weights(
     first: Passages = jax.tree.map(lambda leaf: leaf[0], found)
     normal, least = first.normal, least_travel(model, first, event.ends)
     cell, (last, earlier) = -jnp.maximum(jnp.abs(touch.travel), least), touch.weights
-    weights = jnp.stack([last * here, earlier * previous])[:, None] * normal / cell
+    weights = jnp.stack([last * here, earlier * previous]) / cell
     flags = jnp.stack([touch.valid & (jnp.abs(touch.travel) < least), touch.valid])
-    return jnp.where(touch.valid, weights, 0.0), flags, first.rate
+    return jnp.where(touch.valid, weights, 0.0), normal, flags, first.rate

@@ -341,14 +341,8 @@ def _differentiable_step(scene: Scene, model: mjx.Model, state: State, control: 
 
     def rule(primals: Any, changes: Any) -> Any:
         following, residual = advance(*primals)
-        traced, *point = primals[0], primals[1].qpos, primals[1].qvel, primals[1].act, primals[2]
-        moved = changes[1].qpos, changes[1].qvel, changes[1].act, changes[2]
-        if jax.tree.leaves(changes[0]):
-            through = lambda qacc, traced, *point: _at_solution(scene, whole(traced), qacc, *point)  # noqa: E731
-            change = by_tape(through, following.warmstart, (traced, *point), (changes[0], *moved))
-        else:
-            moved = instantiated(tuple(point), moved)
-            change = step_change(scene, whole(traced), tuple(point), following.warmstart, moved)
+        inputs, moved = ((model, at.qpos, at.qvel, at.act, control) for model, at, control in (primals, changes))
+        change = change_over(scene, whole, inputs, following.warmstart, moved)
         return (following, residual), (State(*change), jnp.zeros_like(residual))
 
     advance = with_rule(solved, rule)
@@ -367,6 +361,28 @@ Point = tuple[Qpos, Qvel, Act, Control]
 
 StepChange = tuple[Array, ...]
 """Changes of positions (nq,), velocities (nv,) and activations (na,) after a step, and of its acceleration (nv,)."""
+
+
+def change_over(
+    scene: Scene,
+    whole: Callable[[list[Any]], mjx.Model],
+    inputs: tuple[Any, ...],
+    qacc: Qvel,
+    changes: tuple[Any, ...],
+) -> StepChange:
+    """`step_change`, which may be over traced arrays of the model, too: by the tape then.
+
+    Args:
+        whole: the model, from the traced ones of its arrays.
+        inputs: these, and what precedes the step.
+        qacc: the converged constrained acceleration there.
+        changes: changes of the inputs, None for arrays that do not change.
+    """
+    traced, *point = inputs
+    if not jax.tree.leaves(changes[0]):
+        moved = instantiated(tuple(point), changes[1:])
+        return step_change(scene, whole(traced), tuple(point), qacc, moved)
+    return by_tape(lambda qacc, of_model, *at: _at_solution(scene, whole(of_model), qacc, *at), qacc, inputs, changes)
 
 
 def step_change(scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change: Point) -> StepChange:

@@ -33,7 +33,7 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -41,11 +41,10 @@ from typing import Any, Final, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
-from mjx_study.graph.derivative_rule import flat_with_rule, instantiated, refusing, with_rule
+from mjx_study.graph.derivative_rule import flat_with_rule, refusing, with_rule
 from mjx_study.graph.native import native_identity
 from mjx_study.graph.scalars import traced_part, unrolled
 from mjx_study.simulation import constraint, guards
@@ -61,17 +60,18 @@ from mjx_study.simulation.dynamics import (
     RunningCost,
     State,
     advance_velocity,
+    change_over,
     entry_by_entry,
     force_stage,
     fwd_position,
     observed_step,
     simulated,
-    step_change,
     trajectory,
     with_solver,
 )
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED
+from mjx_study.simulation.over_model import Moving, moved_by_model, slope_over
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Changes, Events, OnsetCounts, Past, Touch, at_touch, changes, events_of
 
@@ -121,24 +121,23 @@ def corrected(
 ) -> tuple[State, tuple[State, Controls, Float[Array, " horizon"], Any], OnsetCounts]:
     """`dynamics.simulated` with the same values, but derivatives that include the onset term.
 
-    First derivatives with respect to initial state and controls, in forward and reverse mode.
+    First derivatives with respect to initial state, controls and model, in forward and reverse mode.
 
     Args:
-        model: the model to step; may be traced, but not differentiated (TypeError); `drop_in.step` has derivatives
-            over it.
+        model: the model to step; may be traced.
         slots: maximum number of events to correct, earliest first; by default `slots_for` the scene.
         weight: factor of the term; 0 gives the derivatives of `dynamics.simulated`.
     """
     if not guards.num_guards(scene.template):
         found = simulated(scene, model, start, control_law, inputs, running_cost)
         return *found, OnsetCounts.none(start.qpos.dtype)
-    model = without_derivative(model)
+    fixed_model, timestep = without_derivative(model), timestep_of(scene, model)
     slots = slots_for(scene, len(jax.tree.leaves(inputs)[0])) if slots is None else slots
 
     def observe(carry: tuple[State, Past], given: Any):
         state, past = carry
         control, cost = jax.lax.stop_gradient(acted(given, state))
-        following, residual, past, found = with_solver(partial(_observed, scene), model, state, control, past)
+        following, residual, past, found = with_solver(partial(_observed, scene), fixed_model, state, control, past)
         return (following, past), (state, control, following, residual, cost, found)
 
     def acted(given: Any, state: State):
@@ -146,31 +145,38 @@ def corrected(
         return control, running_cost(state, control)
 
     begin = jax.lax.stop_gradient(start)
-    step = partial(observed_step, scene, constraint.run_solver, model)
+    step = partial(observed_step, scene, constraint.run_solver, fixed_model)
     course = lambda given: step(begin, control_law(given, begin))[2]  # noqa: E731
     like = jax.eval_shape(course, jax.tree.map(lambda leaf: leaf[0], inputs))
     (last, past), known = jax.lax.scan(observe, (begin, Past.none(like)), inputs)
     before, controls, after, residuals, costs, found = known
-    terms, counts = _corrections(scene, model, before, controls, after, found, past, slots)
+    terms, events, counts = _corrections(scene, fixed_model, before, controls, after, found, past, slots)
     spread, shift, slope = jax.lax.stop_gradient((weight * terms.spread, weight * terms.shift, terms.slope))
+    of_model = moved_by_model(scene, model, before, events)[:, None]
+    over_model = tuple(jnp.zeros_like(before.qvel).at[events.step].add(of_model * each) for each in (shift, spread))
 
     def follow(state: State, known):
-        given, fixed, values, after, own = known
+        given, fixed, values, after, own, (earlier, later) = known
         state = _moving(fixed, state)
         control, cost = _moving(values, acted(given, state))
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
-        velocity = tangent_of(along_events(shift, slope, own, moved - scene.timestep * state.qvel))
-        shifted = integrate_position(scene.host, state.qpos, velocity, scene.timestep), state.qvel + velocity
+        velocity = tangent_of(along_events(shift, slope, own, moved - timestep * state.qvel) + earlier)
+        shifted = integrate_position(scene.host, state.qpos, velocity, timestep), state.qvel + velocity
         qpos, qvel = _moving((fixed.qpos, fixed.qvel), shifted)
         qvel, act = _known_step(scene, model, (qpos, qvel, state.act, control), after)
-        qvel = qvel + tangent_of(along_events(spread, slope, own, moved))
-        following = State(integrate_position(scene.host, qpos, qvel, scene.timestep), qvel, act, after.warmstart)
+        qvel = qvel + tangent_of(along_events(spread, slope, own, moved) + later)
+        following = State(integrate_position(scene.host, qpos, qvel, timestep), qvel, act, after.warmstart)
         return following, (state, control, cost)
 
     own = jnp.minimum(found.before, slots), jnp.minimum(found.after, slots)
-    known = inputs, before, (controls, costs), after, own
+    known = inputs, before, (controls, costs), after, own, over_model
     moving, (states, controls, costs) = jax.lax.scan(follow, start, known)
     return _moving(last, moving), (states, controls, residuals, costs), counts
+
+
+def timestep_of(scene: Scene, model: mjx.Model) -> float | Scalar:
+    """Timestep h [s] of a model, with its derivative; a number where it is the scene's."""
+    return model.opt.timestep if isinstance(model.opt.timestep, Tracer) else scene.timestep
 
 
 def slots_for(scene: Scene, horizon: int) -> int:
@@ -180,7 +186,7 @@ def slots_for(scene: Scene, horizon: int) -> int:
 
 def _observed(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Control, past: Past):
     after, residual, course = observed_step(scene, solver, model, state, control)
-    return after, residual, *changes(course, past, scene.timestep)
+    return after, residual, *changes(course, past, timestep_of(scene, model))
 
 
 def _moving(known: Any, moving: Any) -> Any:
@@ -197,9 +203,8 @@ def _known_step(scene: Scene, model: mjx.Model, point: Point, after: State) -> t
 
     def rule(primals: Any, changes: Any) -> Any:
         traced, point, after = primals
-        moved = instantiated(point, changes[1])
-        change = step_change(scene, whole(traced), differentiated_once(point), after.warmstart, moved)
-        return step(*primals), change[1:3]
+        inputs = traced, *differentiated_once(point)
+        return step(*primals), change_over(scene, whole, inputs, after.warmstart, (changes[0], *changes[1]))[1:3]
 
     step = with_rule(known, rule)
     return step(traced, point, after)
@@ -227,8 +232,8 @@ def _corrections(
     found: Changes,
     past: Past,
     slots: int,
-) -> tuple[Terms, OnsetCounts]:
-    """Terms of the events, and counts."""
+) -> tuple[Terms, Events, OnsetCounts]:
+    """Terms of the events, the events, and counts."""
     events = events_of(found, slots)
 
     def term(event: Events):
@@ -257,13 +262,12 @@ def _corrections(
     _, each = jax.lax.scan(fill, None, grouped)
     flat = lambda leaf: leaf.reshape(-1, *leaf.shape[1 + len(few) :])[:slots]  # noqa: E731
     terms, strength, narrow, valid, rate = jax.tree.map(flat, each)
-    chatters = events.chattering(rate, scene.timestep)
+    chatters = events.chattering(rate, timestep_of(scene, model))
     spread, shift = (jnp.where(chatters[:, None], 0.0, part) for part in (terms.spread, terms.shift))
-    return terms._replace(spread=spread, shift=shift), events.counts(past, valid, narrow, strength, chatters)
+    terms = terms._replace(spread=spread, shift=shift)
+    return terms, events, events.counts(past, valid, narrow, strength, chatters)
 
 
-Moving = Mapping[int, Array]
-"""Leaves of a model that change, by their places in it."""
 Call = Callable[..., Any]
 """Evaluates `function(solver, model, *arguments)` from (function, model, *arguments)."""
 
@@ -306,7 +310,7 @@ def onset_term(
     slope = normal
     if moving:
         positioned = fwd_position(model, template.replace(qpos=touch.qpos))
-        slope = jnp.concatenate([normal, _slope_over(moving, model, positioned, qvel, event)])
+        slope = jnp.concatenate([normal, slope_over(moving, model, positioned, qvel, event)])
     strength = jnp.maximum(-model.opt.timestep * (normal @ jump) / cell, (model.opt.timestep * found.rate) ** 2)
     term = Terms(last * jump / cell, earlier * jump / cell, slope)
     term, strength = jax.tree.map(lambda each: jnp.where(valid, each, 0.0), (term, strength))
@@ -321,19 +325,6 @@ def with_run_solver(function: Callable[..., Any], model: mjx.Model, *arguments: 
 def with_newton(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
     """The same with Newton's method, for native code."""
     return function(constraint.newton, model, *arguments)
-
-
-def _slope_over(
-    moving: Moving, model: mjx.Model, positioned: mjx.Data, qvel: Qvel, event: Events
-) -> Float[Array, " entries"]:
-    """Derivative of a guard's distance with respect to leaves of the model, at constant position."""
-    leaves, structure = jax.tree.flatten(model)
-
-    def distance(moving: Moving) -> Scalar:
-        moved = structure.unflatten([moving.get(place, leaf) for place, leaf in enumerate(leaves)])
-        return guards.motion(moved, fwd_position(moved, positioned), qvel, event.ends)[0][event.guard]
-
-    return ravel_pytree(jax.grad(distance)(dict(moving)))[0].astype(qvel.dtype)
 
 
 class GuardAtTouch(NamedTuple):
@@ -472,13 +463,7 @@ def along_events(
     return found
 
 
-def without_derivative(model: mjx.Model) -> mjx.Model:
-    """Return the model; differentiating with respect to it raises TypeError."""
-    traced, whole = traced_part(model)
-    return whole(_of_states_only(traced))
-
-
-_of_states_only = refusing(
-    "the onset term of rollouts has derivatives over states and controls, but not over the model: "
-    'mjx_study.step(model, data, onset="linear") has both'
-)
+def without_derivative(tree: Any) -> Any:
+    """Return the pytree, without the derivatives of its traced leaves."""
+    traced, whole = traced_part(tree)
+    return whole(jax.lax.stop_gradient(traced))
