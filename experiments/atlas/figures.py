@@ -43,7 +43,7 @@ def binned(axes: Axes, values: Any, verdict: Any, colour: str) -> None:
     values, verdict = values[kept], verdict[kept]
     if len(values) < 3 * BINS:
         return
-    for part in np.array_split(np.argsort(values.to_numpy()), BINS):
+    for part in np.array_split(np.argsort(values.to_numpy(), kind="stable"), BINS):
         chosen = verdict.to_numpy()[part] == 1
         middle, low, high = coverage_interval(chosen, 0.95)
         at = float(np.exp(np.mean(np.log(values.to_numpy()[part]))))

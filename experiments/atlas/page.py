@@ -10,6 +10,7 @@ from estimators.confidence import coverage_interval
 from experiments import DOCS
 from experiments.atlas.design import LAWS, REFUSED, SMOOTHING
 from experiments.atlas.figures import BINS, FIGURES, TASKS, laws_figure
+from experiments.atlas.jumps import results
 from experiments.atlas.run import RESULTS
 from experiments.atlas.table import (
     GROUPS,
@@ -192,6 +193,19 @@ def smoothing_table(laws: Table) -> str:
     return markdown_table(rows, ("law", "kappa [J]", *(f"off, {each}" for each in factors), *factors))
 
 
+def jumps_table(laws: Table) -> str:
+    """Format what quadrature says of cells that 64 samples decide."""
+    rows = []
+    found = results(laws)
+    for (task, off, law), part in found.groupby(["task", "fobg_off", "contact"], sort=False):
+        large = part[part.large]
+        said = [int((part.verdict == 1).sum()), int((part.verdict == 0).sum()), int(part.verdict.isna().sum())]
+        rows.append([f"`{task}`", f"`{law}`", "off" if off else "right", len(part), *said])
+        rows[-1] += [len(large), int(large.switches.astype(bool).sum())]
+    head = ("task", "law", "64 samples", "cells", "off", "right", "undecided", "one large jump", "at a change of face")
+    return markdown_table(sorted(rows, key=lambda row: (row[0], row[2])), head)
+
+
 def kappa(law: str) -> float:
     """A law's default smoothing [J]."""
     return FAMILIES[law].smoothing
@@ -202,7 +216,7 @@ def tables(table: Table, laws: Table) -> dict[str, str]:
     found = {name: make(table) for name, make in TABLES.items()}
     if len(laws):
         found |= {"laws_off": by_law(table, laws, off_of), "laws_variance": by_law(table, laws, ratio_of)}
-        found |= {"laws_smoothing": smoothing_table(laws)}
+        found |= {"laws_smoothing": smoothing_table(laws), "laws_jumps": jumps_table(laws)}
     return found
 
 
