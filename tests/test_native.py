@@ -323,15 +323,18 @@ def test_long_sources_are_built_quickly(monkeypatch, folder):
 def test_kernels_are_compiled_without_a_gpu(monkeypatch, most):
     """Short ones and long ones, also by an NVRTC that does not know the options, into code for the architecture."""
     point = jax.ShapeDtypeStruct((3,), float)
-    monkeypatch.setitem(c.MOST_TOGETHER, "gpu", (20, most))
-    source = c.source_of(capture(FUNCTIONS["loops"], point, most=999), "gpu")
-    assert source.count("\nAPART void part") > 1
-    kernels = [cuda.compile_kernel(source, "sm_90")]
+    monkeypatch.setitem(c.MOST_TOGETHER, "gpu, long", (20, most))
+    function = capture(FUNCTIONS["loops"], point, most=999)
+    kernels = [cuda.compile_kernel(c.source_of(function, "gpu"), "sm_90")]
     monkeypatch.setattr(cuda, "MOST_OPTIMISED", 0)
+    kernels.append(cuda.compile_kernel(c.source_of(function, "gpu"), "sm_90"))
+    monkeypatch.setattr(c, "LONG_KERNEL", 0)
+    source = c.source_of(function, "gpu")
+    assert source.count("\nAPART void part") > 1
     kernels.append(cuda.compile_kernel(source, "sm_90"))
     monkeypatch.setattr(cuda, "QUICKLY", ("--no-such-option",))
     kernels.append(cuda.compile_kernel(source, "sm_90"))
-    assert all(each.startswith(b"\x7fELF") and b"kernel" in each for each in kernels) and len({*kernels}) == 3
+    assert all(each.startswith(b"\x7fELF") and b"kernel" in each for each in kernels) and len({*kernels}) == 4
     with pytest.raises(ValueError, match='"x1" is undefined'):
         cuda.compile_kernel(source.replace("x1 ", "nothing ", 1), "sm_90")
 

@@ -35,9 +35,12 @@ NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for na
 
 MAX_ARGUMENT: Final = 4000
 """Maximum size of a kernel's argument [bytes]."""
-MOST_TOGETHER: Final = {"cpu": (500, 500), "gpu": (5_000, 20_000)}
+MOST_TOGETHER: Final = {"cpu": (500, 500), "gpu": (20_000, 20_000), "gpu, long": (5_000, 20_000)}
 """Maximum numbers of lines in a function and in a loop that stays in one; compilers allocate registers in more than
 linear time."""
+LONG_KERNEL: Final = 40_000
+"""Operations from which a kernel is compiled as separate functions, in a third of the time, to run at 0.7 of the
+speed."""
 
 
 class NotWrittenError(Exception):
@@ -57,11 +60,15 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
     """
     writer = Writer(function)
     statements, forms_in, forms_out = writer.written(passes)
-    functions, num_kept = in_parts(statements, writer.loads, *MOST_TOGETHER[platform])
+    is_long = platform == "gpu" and function.size > LONG_KERNEL
+    most = MOST_TOGETHER["gpu, long" if is_long else platform]
+    functions, num_kept = in_parts(statements, writer.loads, *most)
     if platform == "gpu":
         kernel = [_text("prelude.cu"), _text("functions.c"), *writer.tables, *functions, _text("kernel.cu")]
         parts = ["#ifdef __CUDACC_RTC__", *kernel, "#else", _text("launcher.c"), "#endif"]
-        return "\n".join([_batch(forms_in, forms_out), f"#define KEPT {num_kept}", *parts, ""])
+        return "\n".join(
+            [_batch(forms_in, forms_out), f"#define KEPT {num_kept}", f"#define LONG {int(is_long)}", *parts, ""]
+        )
     wide = any(dtype.itemsize == 8 for dtype in writer.dtypes)
     return "\n".join(
         [

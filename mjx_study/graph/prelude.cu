@@ -20,11 +20,16 @@ typedef int mask;  // -1 or 0
 #define BITS(type, value) bits<type>(value)
 #define MASK(comparison) (-(mask)(comparison))
 #define ALL(type, constant) ((type)(constant))
+#if LONG
 #define APART static __device__ __noinline__
+#define ENTER __builtin_assume(__isLocal(kept));
+#else
+#define APART static __device__
+#define ENTER
+#endif
 #define PART static __device__
 #define ARGUMENTS const struct batch &batch, const long lane, char *kept, long step
 #define PASSED batch, lane, kept, step
-#define ENTER __builtin_assume(__isLocal(kept));
 
 ONE int any(mask m) { return m; }
 
