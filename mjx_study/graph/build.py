@@ -60,7 +60,7 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
         if shutil.which(words[0]) and (found := _run(*words, "--version")).returncode == 0:
             return tuple(words), found.stdout
     print(
-        "mjx-study: no C compiler found: steps run in NumPy, more slowly; the extra `compiler` brings one",
+        "mjx-study: no C compiler found: steps run more slowly, on CPUs in NumPy; the extra `compiler` brings one",
         file=sys.stderr,
     )
     return None

@@ -20,9 +20,9 @@ CPU_CHUNKS: Final = (11, 101, 201)
 programs; one more than round numbers, for the baseline."""
 MANY: Final = 2000
 """Samples from which a CPU takes the largest chunks, which pay for another program."""
-IN_NUMPY: Final = 1001
+IN_NUMPY: Final = 2001
 """Samples per call where NumPy stands in for native code, which leaves out copies: an operation takes 0.3 us for 100
-samples, 0.4 for 1,000."""
+samples, 0.6 for 2,000."""
 MAX_CHUNK: Final = {"cpu": CPU_CHUNKS[-1], "gpu": 2**17 + 1, "tpu": 2**17 + 1}
 """Maximum number of samples per device and call, by backend."""
 MAX_SHARE: Final = 0.25
