@@ -165,7 +165,9 @@ def write_page() -> None:
             rates = [found[route].get(kind, {}).get("rate", math.nan) for route, kind in COLUMNS]
             built = " + ".join(number(each["built"]) for each in found["native"].values())
             lines.append([f"`{name}`", *map(number, rates), built or "-"])
-        tables[f"speed, {platform}"] = markdown_table(lines, ["robot", *header])
+        columns = [each for each in zip(["robot", *header], *lines, strict=True) if {*each[1:]} != {"-"}]
+        names, *lines = map(list, zip(*columns, strict=True))
+        tables[f"speed, {platform}"] = markdown_table(lines, names)
     found = {name: sizes(name) for name in ROBOTS}
     lines = [[f"`{name}`", *(f"{size:,}" for size in each.values())] for name, each in found.items()]
     write_tables(DOCS / "robots.md", tables | {"size": markdown_table(lines, ["robot", *found["quadruped"]])})
