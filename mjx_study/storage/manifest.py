@@ -42,6 +42,7 @@ class _Config(_Part):
     iterations: Count | None
     points: Count | None = None
     confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
+    onset: Literal["none", "linear", "jump"] = "none"
 
 
 class _Described(_Part):

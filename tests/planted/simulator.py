@@ -53,8 +53,8 @@ DYNAMICS: Final = (
     Defect(
         "columns-swapped",
         "mjx_study/simulation/dynamics.py",
-        "change = step_change(scene, whole(traced), tuple(point), following.warmstart, moved)",
-        "change = step_change(scene, whole(traced), tuple(point), following.warmstart, (*moved[:3], moved[3][::-1]))",
+        "return step_change(scene, whole(traced), tuple(point), qacc, moved)",
+        "return step_change(scene, whole(traced), tuple(point), qacc, (*moved[:3], moved[3][::-1]))",
         "controls in another order than the actuators",
         (f"{STEP}::test_activation_and_control_each_have_their_column",),
         "mechanism",
