@@ -130,7 +130,8 @@ def test_nobody_else_can_connect_to_local_workers(workers: Any) -> None:
 def test_a_local_cluster_leaves_nothing_behind(tmp_path: Path, ended_by: signal.Signals | None) -> None:
     scratch, folder = tmp_path / "scratch", tmp_path / "out"
     scratch.mkdir()
-    with sweep(folder, "local:1", TMPDIR=str(scratch)) as running:
+    many = "100:1e4:60:log" if ended_by else ""  # so many that the signal comes before the last
+    with sweep(folder, "local:1", many, TMPDIR=str(scratch)) as running:
         seen: set[int] = set()
         while running.poll() is None and not list(folder.glob("cells/*.npz")):
             seen |= {path.stat().st_mode & 0o777 for path in scratch.glob("mjx-study-*")}
@@ -188,8 +189,9 @@ def parts(path: Path) -> list[dict[str, Any]]:
     return list(yaml.safe_load_all(path.read_text()))
 
 
-def sweep(folder: Path, address: str = "local:2", **variables: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "mjx_study", "sweep", *ARGUMENTS, "--cluster", address, "--output", str(folder)]
+def sweep(folder: Path, address: str = "local:2", cells: str = "", **variables: str) -> subprocess.Popen[str]:
+    arguments = [cells or each if each == ARGUMENTS[4] else each for each in ARGUMENTS]
+    command = [sys.executable, "-m", "mjx_study", "sweep", *arguments, "--cluster", address, "--output", str(folder)]
     environment = os.environ | {ACCOUNT: str(folder)} | variables
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
