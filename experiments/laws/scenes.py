@@ -7,11 +7,11 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import mjx_study as study
 from experiments.quadruped import HEIGHT, MODEL
 from experiments.starts import Cost, Start, task_of_start
+from mjx_study.claims.thrown import BALL, box, throw
 from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
@@ -24,12 +24,10 @@ PLANE: Final = """<mujoco><option timestep="{}"/><worldbody><geom name="floor" t
   {}</worldbody></mujoco>"""
 THROWN: Final = """<body pos="0 0 {}"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>{}</body>"""
 PITCH: Final = '<joint axis="0 1 0"/>'
-BALL: Final = '<geom name="thrown" size="0.1" mass="1" condim="3"/>'
 SLAB: Final = '<geom name="{}" type="box" size="{} {} 0.1" mass="1" condim="3"/>'
 GEOMS: Final = {
     "ball": BALL,
     "rolling": PITCH + BALL,
-    "box": PITCH + SLAB.format("thrown", 0.2, 0.2),
     "corners": PITCH
     + '<inertial pos="0 0 0" mass="1" diaginertia="0.0167 0.0167 0.0267"/>'
     + "".join(
@@ -37,7 +35,7 @@ GEOMS: Final = {
         for name, x, y in (("thrown", 0.199, 0.199), ("b", -0.199, 0.199), ("c", 0.199, -0.199), ("d", -0.199, -0.199))
     ),
 }
-"""The corners are spheres in place of the box's lower four."""
+"""The corners are spheres in place of the lower four of `box`."""
 
 
 def on_plane(name: str, bodies: str, *numbers: Any) -> Task:
@@ -46,26 +44,8 @@ def on_plane(name: str, bodies: str, *numbers: Any) -> Task:
 
 
 def thrown(name: str, geom: str, horizon: int, start: Start, at: float, sigma: float, cost: Cost) -> Task:
-    """Return a task of one number that sets the start of a ball or box above the ground."""
+    """Return a task of one number that sets the start of a ball on the ground."""
     return on_plane(name, THROWN.format(RADIUS, GEOMS[geom]), horizon, start, at, sigma, cost, ("thrown", "floor"))
-
-
-def throw() -> Task:
-    """A ball falls through a gap [m] at 1 m/s down and along."""
-    moving = jnp.array([SPEED, -SPEED])
-    start = lambda rest, gap: State(rest.qpos.at[1].set(gap[0]), moving, rest.act, rest.warmstart)  # noqa: E731
-    return thrown("throw", "ball", 80, start, GAP, SPREAD, lambda last: 100 * last.qpos[1] ** 2 + last.qpos.sum())
-
-
-def box(geom: str = "box") -> Task:
-    """A box tilted by 0.2 rad falls onto an edge, then the other; the gap [m] is below the first."""
-    lower = 0.2 * np.sin(0.2) + 0.1 * np.cos(0.2) - 0.1
-    moving = jnp.array([SPEED / 2, -SPEED, 0.0])
-
-    def start(rest: State, gap: jax.Array) -> State:
-        return State(jnp.stack([0.0, gap[0] + lower, 0.2]), moving, rest.act, rest.warmstart)
-
-    return thrown(geom, geom, 80, start, GAP, SPREAD, lambda last: 100 * last.qpos[1] ** 2 + last.qpos.sum())
 
 
 def skid(geom: str = "ball") -> Task:
@@ -133,7 +113,13 @@ def quadruped(posture: str) -> Task:
 
 
 SCENES: Final[dict[str, Callable[[], Task]]] = {
-    **{"throw": throw, "skid": skid, "roll": partial(skid, "rolling"), "box": box, "corners": partial(box, "corners")},
+    **{
+        "throw": throw,
+        "skid": skid,
+        "roll": partial(skid, "rolling"),
+        "box": box,
+        "corners": partial(box, "corners", GEOMS["corners"]),
+    },
     **{
         "stack": stack,
         "stacked_corners": partial(stack, "stacked_corners"),

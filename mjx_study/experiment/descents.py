@@ -30,7 +30,7 @@ from mjx_study.experiment.memory import check_memory
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
-from mjx_study.graph.native import in_numpy, native_identity
+from mjx_study.graph.native import computes_steps
 from mjx_study.objective import Simulator, TracedObjective, chunk_for, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.option import OptionError
@@ -193,7 +193,7 @@ class Backend:
     def _in_turn(self) -> bool:
         """Whether an iteration takes seeds in turn, so that any number of them and of samples shares the traces of
         rollouts: where these are native code, which gains nothing from larger batches."""
-        on_host = jax.default_backend() == "cpu" and native_identity() is not None and not in_numpy()
+        on_host = jax.default_backend() == "cpu" and computes_steps() == "native"
         return on_host and self.task.scene.uses_graph
 
     def place(self, state: Descent, index: int) -> Descent:

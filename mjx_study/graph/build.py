@@ -40,8 +40,6 @@ QUICKLY: Final = "-O1", "-fschedule-insns2"
 WELL: Final = ("-O2",)
 MOST_SECONDS: Final = 600
 """Maximum time for a compiler to run [s]."""
-PYTHON: Final = numpy_code.BEGINNING
-"""Beginning of the sources that NumPy runs."""
 PREFIX: Final = "mjx_study_"
 """Beginning of the names of libraries, which are those of their XLA targets."""
 
@@ -85,7 +83,7 @@ def _digest(*parts: Any) -> str:
 
 def build_library(source: str) -> str:
     """Begin to build a library in the background, unless it is known, and return its name."""
-    name = PREFIX + _digest(source, build_identity(source.startswith(PYTHON)))
+    name = PREFIX + _digest(source, build_identity(source.startswith(numpy_code.BEGINNING)))
     with _LOCK:
         if name not in _BUILT:
             _BUILT[name] = future = Future()
@@ -127,7 +125,7 @@ def _finish(name: str, source: str, future: Future[Any]) -> None:
 
 
 def _build(name: str, source: str) -> Any:
-    if source.startswith(PYTHON):
+    if source.startswith(numpy_code.BEGINNING):
         return _kept(name, source.encode())
     with temporary_folder() as folder:
         written, library = Path(folder, f"{name}.c"), Path(folder, f"{name}.so")
@@ -177,7 +175,7 @@ def _cached(name: str) -> Any:
 
 def _loaded(name: str, content: bytes) -> Any:
     """Load a library, register its handler with XLA, and return it; None if that fails."""
-    if content.startswith(PYTHON.encode()):
+    if content.startswith(numpy_code.BEGINNING.encode()):
         library = numpy_code.Library(content.decode())
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="cpu")
         return library

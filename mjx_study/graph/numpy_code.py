@@ -5,6 +5,7 @@ calls a library, and its name is a digest of its content, too: caches need not k
 """
 
 import ctypes
+import functools
 import math
 import re
 import traceback
@@ -257,7 +258,9 @@ def _array(buffer: Any, size: int, kind: str, rank: int) -> np.ndarray:
     return np.frombuffer(memoryview(memory), dtype).reshape(size, count)
 
 
+@functools.cache
 def _version() -> tuple[int, int]:
+    """Version of XLA's interface."""
     header = Path(jax.ffi.include_dir(), "xla", "ffi", "api", "c_api.h").read_text()
     major, minor = (int(re.findall(rf"#define XLA_FFI_API_{part} (\d+)", header)[0]) for part in ("MAJOR", "MINOR"))
     return major, minor

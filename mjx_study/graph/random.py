@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 
 from mjx_study.graph.c import source_of
 from mjx_study.graph.function import Passes, capture
-from mjx_study.graph.native import NativeFunction, in_numpy, native_identity
+from mjx_study.graph.native import NativeFunction, computes_steps
 
 _ROTATIONS: Final = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY: Final = 0x1BD11BDA
@@ -45,7 +45,7 @@ _TAIL: Final = (
 def normal(key: Key[Array, ""], shape: tuple[int, ...], dtype: Any) -> Float[Array, "..."]:
     """Return `jax.random.normal(key, shape, dtype)`, vectors of float64 by native code where there is any."""
     known = jax.random.key_impl(key) == "threefry2x32" and jax.config.values["jax_threefry_partitionable"]
-    if native_identity() is None or in_numpy() or dtype != np.float64 or len(shape) != 1 or not shape[0] or not known:
+    if computes_steps() != "native" or dtype != np.float64 or len(shape) != 1 or not shape[0] or not known:
         return jax.random.normal(key, shape, dtype)
     return _drawing(shape[0], jax.default_backend())(jax.random.key_data(key), jnp.uint32(0))[1].reshape(shape)
 

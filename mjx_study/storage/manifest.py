@@ -13,7 +13,7 @@ from estimators import Estimator, find_estimator
 from estimators.choices import ORACLES
 from estimators.intervals import Interval
 from estimators.registry import ESTIMATORS, label_of
-from mjx_study.choices import KINDS
+from mjx_study.choices import KINDS, ONSETS
 from mjx_study.experiment.study import StudyCell, StudyPlan, estimators_of
 from mjx_study.graph.native import computes_steps
 from mjx_study.identity import git_revision, versions
@@ -42,7 +42,7 @@ class _Config(_Part):
     iterations: Count | None
     points: Count | None = None
     confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
-    onset: Literal["none", "linear", "jump"] = "none"
+    onset: Literal[ONSETS] = "none"  # type: ignore[valid-type]
 
 
 class _Described(_Part):
