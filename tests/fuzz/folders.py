@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Final
 
-from tests.fuzz.answers import Row, SilentError
+from tests.fuzz.answers import Row, WrongError
 from tests.fuzz.forgeries import FORGERIES
 from tests.fuzz.studies import STUDIES, draw, make, resume
 
@@ -33,5 +33,5 @@ def forge(kind: str, count: int, root: Path) -> Row:
             row.codes[codes[-1]] += 1
             codes.append(resume(study, at, outside))
             if refuse and 0 in codes:
-                raise SilentError(f"accepted: exit codes {codes}")
+                raise WrongError(f"accepted: exit codes {codes}")
     return row
