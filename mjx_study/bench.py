@@ -89,7 +89,6 @@ class BenchReport:
 
     @property
     def ratios(self) -> dict[str, float]:
-        """The ratios of `RATIOS` that apply."""
         seconds = self.seconds
         return {name: seconds[one] / seconds[other] for name, (one, other) in RATIOS.items() if one in seconds}
 

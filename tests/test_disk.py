@@ -193,9 +193,6 @@ def test_a_link_in_a_study_is_refused_and_not_followed(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match="00001.npz is damaged .it is a symbolic link.; move it away"):
         Store.open(folder).read(1)
     (folder / "cells" / "00001.npz").unlink()
-    linked(folder / "cells" / "00001.failed", outside / "cell")
-    with pytest.raises(StudyError, match="00001.failed is damaged .it is a symbolic link.; remove it"):
-        _ = Store.open(folder).failures
     linked(folder / "study.lock", outside / "new")
     with (
         pytest.raises(StudyError, match="cannot lock .*study.lock: it is a symbolic link"),
@@ -210,21 +207,6 @@ def test_a_link_in_a_study_is_refused_and_not_followed(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot write to the output folder .*cells: it is a symbolic link"):
         Store.create(folder, DOCUMENT)
     assert [path.name for path in outside.iterdir()] == ["cell"]
-
-
-def test_a_failure_is_as_it_was_written(tmp_path: Path) -> None:
-    store = Store.create(tmp_path, DOCUMENT)
-    store.write_failure(1, "no memory")
-    assert store.failures == {1: "no memory"}
-    path = tmp_path / "cells" / "00001.failed"
-    for content, says in (
-        (path.read_bytes().replace(b"no", b"so"), "its digest does not match"),
-        (b"no memory", "Invalid JSON"),
-        (b'{"reason": "no memory"}', "digest: Field required"),
-    ):
-        path.write_bytes(content)
-        with pytest.raises(StudyError, match=f"00001.failed is damaged .{says}.*; remove it"):
-            _ = store.failures
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:

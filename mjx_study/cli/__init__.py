@@ -54,7 +54,6 @@ ALIASES: Final = {"optimize": "optimise"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
     # Suppress XLA's banners about programs that take minutes to compile; failures still raise.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:

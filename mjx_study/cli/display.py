@@ -71,7 +71,6 @@ class Activity:
 
     @contextmanager
     def listening(self) -> Generator[None]:
-        """Listen to JAX."""
         from jax import monitoring
 
         monitoring.register_scalar_listener(self.began)
@@ -147,7 +146,6 @@ class Display:
 
 @contextmanager
 def ticking(tick: Callable[[], None], seconds: float = TICK) -> Generator[None]:
-    """Call a function at intervals, in a thread."""
     ended = threading.Event()
 
     def look() -> None:

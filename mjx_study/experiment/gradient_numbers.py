@@ -73,7 +73,6 @@ def padded(leaf: Any, size: int) -> Any:
 
 @partial(jax.jit, static_argnames="chosen")
 def samples_of_parts(batches: Batches, chosen: tuple[Estimator, ...]) -> list[list[Array]]:
-    """Samples of each estimator's parts."""
     return [[part.per_sample for part in each.parts(*each.pick(batches))] for each in chosen]
 
 

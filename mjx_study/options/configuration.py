@@ -287,7 +287,6 @@ class StudyConfig:
 
     @property
     def task_names(self) -> list[str]:
-        """Names of the tasks."""
         return [each.name if isinstance(each, NamedTask) else each for each in self.tasks]
 
     @property

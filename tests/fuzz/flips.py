@@ -62,7 +62,7 @@ def _of_studies(root: Path) -> Iterator[tuple[Path, Callable[[], int]]]:
                 refused = True
                 if "\n" in str(error):
                     raise WrongError(f"more than a line: {error}") from None
-            needless = path.name.endswith((".part.npz", ".failed"))  # for drawing
+            needless = path.name.endswith(".part.npz")  # for drawing
             if command and studies.draw(folder, root / "nothing", command) != (2 if refused and not needless else 0):
                 raise WrongError(f"another exit code of {command}")
             return 2 if refused else 0
@@ -76,7 +76,7 @@ def _numbers(folder: Path) -> str:
     cells = {index: store.read(index) for index in range(len(store.document["cells"])) if store.has(index)}
     parts = {index: store.read_part(index) for index in store.missing}
     plain = {key: {name: array.tolist() for name, array in each.items()} for key, each in (cells | parts).items()}
-    return json.dumps([store.document, plain, store.failures], sort_keys=True)
+    return json.dumps([store.document, plain], sort_keys=True)
 
 
 def _of_caches(root: Path, draw: random.Random) -> Iterator[tuple[Path, Callable[[], int]]]:

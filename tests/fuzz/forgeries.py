@@ -149,7 +149,7 @@ def archives() -> dict[str, bytes]:
 
 
 def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
-    """Forgeries of the file of a cell, a checkpoint or a failure."""
+    """Forgeries of the file of a cell or a checkpoint."""
     whole = (folder / "cells" / "00000.npz").read_bytes()
     directory = whole.rindex(b"PK\x05\x06")
     members = archives() | {
@@ -186,23 +186,11 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
             np.savez(file.path, digest=signed, **kept)  # type: ignore[arg-type]
 
         yield f"versions of a cell: {name}", written, True
-    failures = (
-        b"", b"{", b"[]", b"\xff\xfe", b"[" * 10**5,
-        b'{"reason": 1, "digest": ""}', b'{"reason": "a\\nb", "digest": "0"}',
-    )  # fmt: skip
-    for content in failures:
-
-        def failed(at: Path, _: Path, content: bytes = content) -> None:
-            (at / "cells" / "00001.npz").unlink()
-            (at / "cells" / "00001.failed").write_bytes(content)
-            (at / "cells" / "nonsense.failed").write_bytes(content)
-
-        yield f"a failure of {content[:20]!r}", failed, False
 
 
 def entries(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
     """Forgeries of what lies in a folder: links, pipes, sockets, devices, folders and sparse files."""
-    places = ("study.json", "study.lock", "results.nc", "cells/00000.npz", "cells/00001.part.npz", "cells/00001.failed")
+    places = ("study.json", "study.lock", "results.nc", "cells/00000.npz", "cells/00001.part.npz")
 
     def cleared(at: Path, place: str) -> Path:
         if "00001" in place:
