@@ -34,6 +34,7 @@ def configured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The one line with which a command refuses its arguments, before it prints or writes anything."""
     before = set(Path().iterdir())
+    capsys.readouterr()
     assert cli.main(arguments) == 2
     printed = capsys.readouterr()
     assert printed.err.count("\n") == 1 and printed.out == "" and set(Path().iterdir()) == before

@@ -84,15 +84,7 @@ class Activity:
 
 
 class Display:
-    """Progress whose counters never run backwards, with a sign of life after each silence.
-
-    Args:
-        show: shows progress.
-        activity: what is built.
-        clock: the time [s].
-        within: shortest time between calls of `show` for one stage [s].
-        silence: time without a call of `show` before a sign of life [s].
-    """
+    """Progress whose counters never run backwards, with a sign of life after each silence; see `WITHIN`, `SILENCE`."""
 
     def __init__(
         self,

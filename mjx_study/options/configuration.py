@@ -14,8 +14,7 @@ from estimators.choices import DENSITIES, suggestion
 from estimators.registry import ESTIMATORS
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS
 from mjx_study.options.estimator_options import of_estimators, with_options_of_estimators
-from mjx_study.options.numbers import MAX_VALUES
-from mjx_study.options.option import OptionError, Rows, declared, options_of
+from mjx_study.options.option import MAX_VALUES, OptionError, Rows, declared, options_of
 from mjx_study.options.rules import check_span, reject_untaken
 
 if TYPE_CHECKING:
@@ -61,11 +60,7 @@ class NamedTask(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Options of a configuration with their defaults in place of None; those of other kinds of study have no effect.
-
-    Attributes:
-        points: number of thetas at which batches are drawn: one, unless along a line.
-    """
+    """Options of a configuration with their defaults in place of None; those of other kinds of study have no effect."""
 
     kind: str
     points: int = 1

@@ -15,7 +15,7 @@ import numpy as np
 from mjx_study.disk import read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
 from mjx_study.storage.arrays import MOST_CELL_BYTES, read_arrays, write_arrays
-from mjx_study.storage.schema import validated
+from mjx_study.storage.manifest import validated
 
 VERSIONS: Final = "versions"
 """Entry that records the versions that computed a cell."""
@@ -23,12 +23,7 @@ VERSIONS: Final = "versions"
 
 @dataclasses.dataclass(frozen=True)
 class CellFile:
-    """A file of a cell's numbers.
-
-    Attributes:
-        study: digest of the study.
-        cell: digest of the cell's index and coordinates.
-    """
+    """File of a cell's numbers, with digests of the study, and of the cell's index and coordinates."""
 
     path: Path
     study: str
