@@ -1,22 +1,16 @@
 """Caches on disk: private, checked before use, and remade if damaged."""
 
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import optax
 import pytest
 
-from estimators import Differentiation
 from mjx_study import disk, runtime
 from mjx_study.caches import digested, read_cached, undigested, write_cached
 from mjx_study.disk import private_folder
 from mjx_study.runtime import configure, traces_folder
-from mjx_study.structure import describe, restore
 from tests.faults import deadline, put_no_file
 from tests.processes import run_script
 
@@ -144,20 +138,3 @@ def test_with_bits_flipped_in_every_file_of_the_cache_the_numbers_are_the_same(t
     """Programs, traces and libraries, none of which anybody else can read."""
     done = run_script(FLIPPED, tmp_path / "cache", "2")
     assert int(done.stdout) > 2 and "Error reading persistent" not in done.stderr
-
-
-# Structures.
-
-
-def test_a_structure_is_plain_data_and_comes_back() -> None:
-    state = optax.adam(0.1).init(jnp.zeros(3))
-    batch = Differentiation(jnp.zeros(2), jnp.zeros((2, 3)))
-    for tree in (0, None, (), [], {"b": 1, "a": (2, [None, 3])}, state, {"batch": batch, "state": [state]}):
-        structure = jax.tree.structure(tree)
-        assert restore(json.loads(json.dumps(describe(structure)))) == structure
-
-
-@pytest.mark.parametrize("tree", [jax.tree_util.Partial(jnp.sin, 1), NamedTuple("Own", [("value", Any)])(1)])
-def test_structures_that_cannot_be_pickled_are_refused(tree: Any) -> None:
-    with pytest.raises(ValueError, match="the structure cannot be kept: "):
-        describe(jax.tree.structure(tree))

@@ -32,7 +32,6 @@ LAYERS = [
     "mjx_study.sources",
     "mjx_study.digest",
     "mjx_study.identity",
-    "mjx_study.structure",
     "mjx_study.compiled",
     "mjx_study.objective",
     "mjx_study.gradcheck",
