@@ -11,8 +11,7 @@ from typing import Any, NoReturn
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import options
-from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS, as_arguments
+from mjx_study.options.configuration import OPTIONS, as_arguments
 from mjx_study.plots.style import PAGE
 from mjx_study.results.rows import rows_of
 from mjx_study.storage.folder import load_study
@@ -105,13 +104,6 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(tasks) == list(TASKS)
     assert tasks["pusher"]["params"] == 200 and tasks["pusher"]["effective_mass"] == pytest.approx(0.05)
     assert tasks["double_pendulum"]["effective_mass"] is None
-
-
-def test_iterations_of_the_solver_and_of_a_descent_are_different_options() -> None:
-    parse = cli.parser().parse_args
-    parsed = parse(["optimise", "pusher", "--solver-iterations", "7", "--iterations", "5"])
-    assert as_arguments(options.given_options(parsed, *SCENE_OPTIONS)) == {"iterations": 7}
-    assert parsed.iterations == 5
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_nobody_else_can_connect_to_local_workers(workers: Any) -> None:
             urlopen(f"http://127.0.0.1:{port}/{page}", timeout=3)
 
 
-@pytest.mark.parametrize("ended_by", [None, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("ended_by", [None, signal.SIGTERM])
 def test_a_local_cluster_leaves_nothing_behind(tmp_path: Path, ended_by: signal.Signals | None) -> None:
     scratch, folder = tmp_path / "scratch", tmp_path / "out"
     scratch.mkdir()

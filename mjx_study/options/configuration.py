@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, Protocol, Union, runtime_checkable
 
-from estimators.choices import DENSITIES, suggestion
+from estimators.choices import DENSITIES
 from estimators.registry import ESTIMATORS
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS
 from mjx_study.options.estimator_options import of_estimators, with_options_of_estimators
@@ -199,14 +199,6 @@ class StudyConfig:
     block_size: int | None = declared(
         None, "N", "samples held at once", "[2, 1e7]", study="gradients", unset="all, if they fit"
     )
-
-    def __new__(cls, **given: Any) -> "StudyConfig":
-        """Suggest a name for a misspelt one."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        for name in given:
-            if name not in names:
-                raise TypeError(f"{cls.__name__} has no option {name!r}{suggestion(name, names)}")
-        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         for name, option in OPTIONS.items():
