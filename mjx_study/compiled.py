@@ -310,8 +310,7 @@ def _header(structure: Any, inputs: Mapping[str, str]) -> bytes:
 
 
 def _read(path: Path, name: str) -> Callable[..., Any] | None:
-    """Load the function whose trace is in a file; None if the file is missing or unreadable, a library of native code
-    that it calls is missing, or an input differs."""
+    """The function whose trace is in a file; None if this or a library it calls is unusable, or an input differs."""
     kept = read_cached(path)
     try:
         return None if kept is None or not all(map(library_ready, libraries_in(kept))) else _load(kept, name)

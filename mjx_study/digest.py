@@ -242,8 +242,7 @@ class Digest:
                 self._all(f"global {name}", (value,))
 
     def _global(self, module: str, name: str, value: Any, names: set[str]) -> None:
-        """Add what a function reads from a module: data by a separate digest, which has a name in messages; of
-        another module those of the names that the function uses."""
+        """Add what a function reads from a module: data by a digest of its own; of another module the names it uses."""
         if isinstance(value, types.ModuleType):
             if is_users(value.__name__):
                 for each in sorted(names & vars(value).keys()):

@@ -137,8 +137,7 @@ def _of_seeds(numbers: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 
 def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:
-    """Each estimator's bias relative to the norm of the reference, from the means of its seeds; nothing is compiled for
-    their number."""
+    """Each estimator's bias over the reference's norm, from its seeds' means; compiled for no number of them."""
     means, reference = np.stack([row["gradient"] for row in numbers]), jax.device_get(reference)
     square = np.sum(reference.mean**2)
     with np.errstate(all="ignore"):

@@ -151,8 +151,7 @@ def _order(zeroth: Row, first: Row) -> str:
 
 
 def _bias_findings(rows: Sequence[Row], gammas: Bounds, label: Callable[[str], str]) -> list[str]:
-    """Report means farther from the reference than any draw of the test, or off but undecided, in a sentence each; with
-    several seeds, with counts and the median debiased error."""
+    """Report means that are biased, or off but undecided; with several seeds, counts and median debiased error."""
     sentences = []
     for (estimator,), mine in _by((row for row in rows if differentiates(row.estimator)), "estimator").items():
         seeds = len(_by(mine, "seed"))

@@ -39,8 +39,7 @@ def numbers_of(dataset: xr.Dataset) -> tuple[list[str], list[list[str]]] | None:
 
 
 def _text(name: str, variable: Variable, one: xr.Dataset) -> str:
-    """Format the sum of counts, the median of other numbers over the seeds and the last tenth of iterations, with its
-    standard error where that of a single number is known."""
+    """Sum of counts, median of others over seeds and the last tenth of iterations; with the error of a single one."""
     values, error = one[name], one.get(f"{name}_se")
     error = math.nan if error is None or error.size > 1 else error.item()
     if "iteration" in values.dims and variable.digits:
