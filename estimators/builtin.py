@@ -192,13 +192,7 @@ class OneWeight(Interpolation):
 class AlphaOrder(OneWeight):
     """Alpha order: the two interpolated with an error of at most gamma.
 
-    Attributes:
-        baseline: A name in `BASELINES`, for the zeroth-order batch.
-        weights: A name in `WEIGHTS`, the source of alpha.
-        gamma: Largest acceptable error, > 0 or infinity, [cost/param].
-        failure_probability: Failure probability of the confidence radius, in (0, 1); see `bernstein_epsilon`.
-        variance_proxy: "variance", "second_moment" or "upper_bound".
-        radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
+    Gamma and the radius are in [cost/param]; the last three options are those of `bernstein_epsilon`.
     """
 
     name, label, needs = "aobg", "AoBG", ("evaluation", "differentiation")

@@ -29,17 +29,13 @@ def truncated_first_order(linearisation: Linearisation, window: int) -> Gradient
     formed: less variance where products grow, and a bias, since later effects are left out. A window of at least the
     horizon gives the first-order batched gradient.
     """
-    check_window(window)
+    if window < 1:
+        raise ValueError(f"window must be at least 1 step; got {window}")
     horizon = linearisation.cost_state.shape[1]
     keeps = jnp.arange(1, horizon + 1) % window != 0
     keeps = keeps.at[-1].set(True) if horizon else keeps  # the end of the horizon is not a cut
     adjoint, controls, _ = _sweep(linearisation, keeps)
     return summarise(_gradient(linearisation, adjoint, controls))
-
-
-def check_window(window: int) -> None:
-    if window < 1:
-        raise ValueError(f"window must be at least 1 step; got {window}")
 
 
 def total_propagation(linearisation: Linearisation, baseline: str, weights: str = PLUG_IN) -> GradientEstimate:

@@ -153,7 +153,8 @@ def discontinuity_gated(
 
     Reference: Onoda, Parmas, Yaguchi, Matsuo, arXiv 2604.18161, ICLR 2026.
     """
-    check_tolerance(tolerance)
+    if not 0.0 <= tolerance < 1.0:
+        raise ValueError(f"tolerance must lie in [0, 1); got {tolerance}")
 
     def parts(evaluation: Evaluation, differentiation: StepDifferentiation) -> tuple[GradientEstimate, ...]:
         first = summarise(pull_back(_noise_gradients(differentiation), differentiation.policy_jacobian))
@@ -173,11 +174,6 @@ def discontinuity_gated(
         return apply_choice(choice, *parts(evaluation, differentiation))
 
     return weigh_batches(choose, mix, (evaluation, differentiation), weights)
-
-
-def check_tolerance(tolerance: float) -> None:
-    if not 0.0 <= tolerance < 1.0:
-        raise ValueError(f"tolerance must lie in [0, 1); got {tolerance}")
 
 
 def _noise_gradients(differentiation: StepDifferentiation) -> Controls:

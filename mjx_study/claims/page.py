@@ -33,7 +33,6 @@ def run_summary(document: dict[str, Any]) -> str:
 
 
 def verdict_counts(document: dict[str, Any]) -> str:
-    """Count the verdicts of each kind."""
     found = Counter(each["verdict"] for claim in document["claims"] for each in claim["evidence"])
     listed = ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS if found[verdict])
     without = document.get("not_checked", 0)

@@ -72,7 +72,6 @@ def difference_of_engines(
 
 
 def _relative(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Largest difference, relative to the largest magnitude."""
     return largest(ours - theirs) / max(largest(theirs), largest(ours), 1e-10)
 
 

@@ -58,7 +58,7 @@ class Compiler:
 
 
 def compiled(name: str, function: Callable[..., Any], *made_of: Any) -> Compiled:
-    """A program of a check, made of the code of checks and what else the function captures."""
+    """A program made of the code of checks and what else the function captures."""
     return Compiled(function, name, *made_of, code_of(__name__))
 
 
@@ -71,11 +71,8 @@ class ContactCase(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Linear:
-    """Value and derivatives of a step at one state.
-
-    Attributes:
-        tape: reverse-mode Jacobian on the tape, if `reverse` uses the Jacobian program; else None.
-    """
+    """Value and derivatives of a step at one state; `tape` is the reverse-mode Jacobian on the tape, if `reverse` uses
+    the Jacobian program."""
 
     qpos: Float[np.ndarray, " nq"]
     residual: float
@@ -89,7 +86,7 @@ class Exact:
     """A step with constraints solved to rounding.
 
     Attributes:
-        after: state after the step, with the constrained acceleration as its warm start.
+        after: with the constrained acceleration as its warm start.
         stages: quantities before the constraint solve.
         outputs: (position relative to a reference, velocity, activation) after each change.
     """
@@ -115,7 +112,6 @@ class Programs:
         self._stock_step = compiled("mjx.step", self._step_of_mjx, *made_of)
 
     def start(self, case: ContactCase, base: HostState, *, stock: bool) -> None:
-        """Start compiling the programs of `linear`, `exact`, `stock_step` and, on request, `stock`."""
         point, inputs, outputs = _point(case, base), len(self.layout.inputs), len(self.layout.outputs)
         for size in reversed(self._sizes):
             self.compiler.start(self._linear, point, _unit_rows(0, size), _unit_rows(0, outputs))
@@ -138,7 +134,6 @@ class Programs:
         return Exact(_host(after, base), stages, outputs[: len(changes)])
 
     def linear(self, case: ContactCase, base: HostState) -> Linear:
-        """Compute the value and derivatives of the project's step at a state."""
         found = [self._derivatives(size, case, base) for size in self._sizes]
         own, tape = found[0], found[-1]
         if own is tape:

@@ -54,7 +54,6 @@ def compare_values(
 
     Args:
         ours, stock: next states of this project and `mjx.step`, with the step's acceleration as warm start.
-        stages: MJX's intermediate quantities at `state`.
         noise: rounding noise of each output; at rest, all of its change.
     """
     theirs = engine_step.after(state)

@@ -74,7 +74,6 @@ def model_title(one: xr.Dataset, between: str = ", ") -> str:
 
 
 def positions(rows: xr.Dataset) -> np.ndarray:
-    """Stiffnesses for a logarithmic axis [N/m]."""
     return np.where(rows["stiffness"].values > 0, rows["stiffness"].values, NO_CONTACT)
 
 
@@ -91,7 +90,6 @@ def families(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
 def against_stiffness(
     part: xr.Dataset, title: str, ylabel: str, draw: Callable[[Axes, xr.Dataset, np.ndarray], None], *, log: bool = True
 ) -> Figure:
-    """Plot one panel per contact family."""
     found = families(part)
     figure, grid = make_panels(1, len(found), 1.4 + 3.2 * len(found), 3.9, title, sharey=True)
     for axes, (family, rows) in zip(grid[0], found, strict=True):

@@ -64,12 +64,9 @@ class Poses:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Motion:
-    """A model's motion.
+    """Generalised positions of a model [m or rad; unit quaternions] at increasing times [s].
 
-    Attributes:
-        time: increasing times [s].
-        qpos: generalised positions at these times [m or rad; unit quaternions].
-        focus: geoms shown in every picture, however far they are from the motion.
+    Geoms in `focus` are shown in every picture, however far they are from the motion.
     """
 
     model: mujoco.MjModel
@@ -116,7 +113,6 @@ class Motion:
 
     @cached_property
     def poses(self) -> Poses:
-        """Forward kinematics at every time."""
         model, data = self.model, mujoco.MjData(self.model)
         count = len(self.time)
         position, rotation = np.empty((count, model.ngeom, 3)), np.empty((count, model.ngeom, 9))
@@ -151,7 +147,6 @@ class Bounds:
         return self.high - self.low
 
     def united(self, other: "Bounds") -> "Bounds":
-        """Smallest rectangle around both."""
         return Bounds(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def cut(self, other: "Bounds") -> "Bounds | None":

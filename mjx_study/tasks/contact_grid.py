@@ -44,7 +44,6 @@ class ContactPoint:
 
     @property
     def analytic(self) -> bool:
-        """Whether this is the task's analytic system."""
         return self.family == REFERENCE
 
     @property
@@ -54,7 +53,6 @@ class ContactPoint:
 
     @property
     def label(self) -> str:
-        """Family, and stiffness if there is one."""
         return self.family if self.stiffness is None else f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m"
 
 
