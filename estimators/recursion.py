@@ -49,10 +49,7 @@ def total_propagation(linearisation: Linearisation, baseline: str, weights: str 
     open loop nothing propagates through the policy, and steps are mixed independently. Both estimates come from the
     same rollouts, as published, and so are not independent.
 
-    Args:
-        linearisation: Batch of linearised rollouts, with the derivatives of every step.
-        baseline: A name in `BASELINES`, applied step by step; another is a ValueError.
-        weights: A name in `WEIGHTS`, the source of alpha_h.
+    The baseline is applied step by step; a name that is not in `BASELINES` is a ValueError.
 
     Reference: Parmas, Rasmussen, Peters, Doya, "PIPPS: Flexible model-based policy search robust to the curse of
     chaos", ICML 2018, where noise acts on states; here it acts on controls.

@@ -177,7 +177,7 @@ def _touches(trials: Sequence[Trial], steps: int) -> tuple[dict[tuple[int, int],
                 continue
             counts[pair] = counts.get(pair, 0) + 1
             known = found.setdefault(pair, dataclasses.replace(touch))
-            known.depth, known.steps = max(known.depth, touch.depth), max(known.steps, touch.steps)
+            known.depth = max(known.depth, touch.depth)
             if touch.first < known.first:
                 known.first, known.speed = touch.first, touch.speed
     return found, {pair: count / len(trials) for pair, count in counts.items()}

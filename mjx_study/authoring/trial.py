@@ -41,13 +41,12 @@ class Drive:
 
 @dataclasses.dataclass
 class Touch:
-    """A pair of geoms in contact during a rollout: step of the first touch, approach speed then [m/s], greatest
-    penetration [m], number of steps in contact."""
+    """A pair of geoms in contact during a rollout: step of the first touch, approach speed then [m/s], and greatest
+    penetration [m]."""
 
     first: int
     speed: float
     depth: float = 0.0
-    steps: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -116,6 +115,5 @@ def _note(
         first, second = sorted(geoms.tolist())
         touch = touches.setdefault((first, second), Touch(step, approach))
         touch.depth = max(touch.depth, -float(distance))
-        touch.steps += 1
     limited = data.efc_type[: data.nefc] == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
     limits.update(data.efc_id[: data.nefc][limited].tolist())

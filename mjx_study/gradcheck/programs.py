@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from mjx_study.compiled import Compiled
 from mjx_study.gradcheck.coordinates import Coordinates
-from mjx_study.gradcheck.engine_difference import STAGES
+from mjx_study.gradcheck.values import STAGES
 from mjx_study.identity import code_of
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx

@@ -127,12 +127,8 @@ class Motion:
 
     def at(self, count: int) -> Int[np.ndarray, " count"]:
         """Indices of `count` evenly spaced times from first to last, or of all if there are fewer."""
-        if len(self.time) == 1:
-            return np.zeros(1, int)
         wanted = np.linspace(self.time[0], self.time[-1], count)
-        after = np.clip(np.searchsorted(self.time, wanted), 1, len(self.time) - 1)
-        nearer = np.where(wanted - self.time[after - 1] <= self.time[after] - wanted, after - 1, after)
-        return np.unique(nearer)
+        return np.unique(np.argmin(np.abs(self.time[:, None] - wanted), axis=0))
 
 
 @dataclasses.dataclass(frozen=True)

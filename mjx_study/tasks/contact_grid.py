@@ -71,7 +71,6 @@ def family_grid(
 
     Args:
         task: source of the effective mass and of defaults for arguments that are None.
-        families: names of contact families; "reference" for the analytic system.
         stiffnesses: stiffnesses for families that take one [N/m].
         damping: override of each family's damping [N s/m].
         smoothing: override of the smoothing kappa of laws other than MuJoCo's [J].

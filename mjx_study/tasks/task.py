@@ -66,7 +66,6 @@ class StudyDefaults:
         damping: contact damping in families without a damping ratio [N s/m], or None; friction needs some, since it is
             the resistance to slip.
         gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default (inverse-variance weighting).
-        published: AoBG's constants in the published example, or None.
         recipe: settings of gradient descent; None if they must all be given.
         span: range of a landscape over a scalar parameter; None for a range about theta.
     """
