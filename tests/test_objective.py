@@ -427,14 +427,3 @@ def test_batches_refuse(simulator, name: str, sigma: float | None, params: int, 
 def test_tasks_and_simulators_refuse(make, message: str):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_the_form_of_gradients_follows_from_that_of_values() -> None:
-    simulator = pusher_simulator()
-    for name in ("gradient", "corrected"):
-        arguments = simulator._chunk(pusher_task().theta, penalty(10.0), SIGMA)
-        traced = simulator._programs[name].outputs(*arguments)
-        found = simulator.form(name, pusher_task().theta, penalty(10.0), SIGMA)
-        assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), found) == jax.tree.map(
-            lambda leaf: (leaf.shape, leaf.dtype), traced
-        )
