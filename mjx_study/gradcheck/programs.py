@@ -6,7 +6,6 @@ one by one (`lax.map`) rather than as a batch.
 
 import dataclasses
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study.compiled import Compiled
+from mjx_study.compiled import Builds, Compiled
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.values import STAGES
 from mjx_study.identity import code_of
@@ -36,24 +35,16 @@ DIRECTIONS: Final = 96
 """Maximum number of directions, forwards or backwards, per call of a derivative program."""
 
 
-class Compiler:
+class Compiler(Builds):
     """Compiles programs fast, with little optimisation, in background threads."""
 
     def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="compile")
-        self._running: list[tuple[Compiled, Future[None]]] = []
-
-    def start(self, program: Compiled, *arguments: Any) -> None:
-        """Trace the program for the shapes of the arguments, and compile it in the background."""
-        options = OPTIONS if jax.default_backend() == "cpu" else None
-        self._running.append((program, self._pool.submit(program.ahead(*arguments, options=options))))
+        super().__init__(THREADS, OPTIONS if jax.default_backend() == "cpu" else None)
 
     def run(self, program: Compiled, *arguments: Any) -> Any:
         with awaited():
             self.start(program, *arguments)
-            for _, future in [each for each in self._running if each[0] is program]:
-                future.result()
-            self._running = [each for each in self._running if each[0] is not program]
+            self.wait(program)
             return program(*arguments)
 
 
