@@ -27,6 +27,7 @@ from experiments.laws.measure import (
     TRAINED,
     bodies,
     checked,
+    compared,
     corner,
     faithful,
     integrated,
@@ -67,7 +68,8 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
     found |= {("corner", row): partial(corner, **changes) for row, changes in CORNER.items()}
     for name, law, cone in itertools.product(CHECKED, OTHERS, ("", "pyramidal")):
         if not cone or (name, law) in PYRAMIDAL:
-            found[f"gradcheck {name}{' ' * bool(cone)}{cone}", law] = partial(checked, name, law, cone)
+            for kind, compute in (("gradcheck", checked), ("compare", compared)):
+                found[f"{kind} {name}{' ' * bool(cone)}{cone}", law] = partial(compute, name, law, cone)
     return found
 
 
@@ -95,7 +97,7 @@ def run(asked: dict[tuple[str, str], Callable[[], dict[str, Any]]], into: Path |
             name: float(each) if np.ndim(each) == 0 and not isinstance(each, str | None) else each
             for name, each in numbers.items()
         }
-        with (into or (CHECKS if scene.startswith(("gradcheck", "corner")) else CELLS)).open("a") as file:
+        with (into or (CHECKS if scene.startswith(("gradcheck", "compare", "corner")) else CELLS)).open("a") as file:
             file.write(json.dumps({"scene": scene, "row": row, **numbers}) + "\n")
         print(f"{scene}, {row}: {time.perf_counter() - begin:.0f} s", flush=True)
 

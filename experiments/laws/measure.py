@@ -25,6 +25,7 @@ from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.gradcheck import gradcheck, plan_gradcheck
 from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
+from mjx_study.results.rows import rows_of
 from mjx_study.simulation.contact import (
     ContactModel,
     apply_contact,
@@ -52,6 +53,8 @@ TRAINED: Final = {
     "ball_wall": {"iterations": 40, "samples": (30,), "learning_rate": 1.0},
 }
 SEEDS, DRAWS = 3, 1000
+BATCH: Final = 1000
+"""Samples, and pairs of rollouts of the reference, of `compared`."""
 DURATION, NARROW = 0.8, 1e-6  # [s], [rad]
 
 
@@ -271,6 +274,32 @@ def checked(name: str, family: str, cone: str) -> dict[str, Any]:
         "of_step": of_step.differences,
         "of_parameters": of_step.parameters,
         "exercised": of_step.coverage.line(),
+    }
+
+
+def compared(name: str, family: str, cone: str) -> dict[str, Any]:
+    """What `compare` says of first order's mean under a law, at the task's middle stiffness."""
+    stiffnesses = make_task(name).defaults.stiffnesses
+    given: dict[str, Any] = {"cone": (cone,)} if cone else {}
+    if FAMILIES[family].swept:
+        given["stiffness"] = (float(stiffnesses[len(stiffnesses) // 2]),)
+    about = StudyConfig(
+        tasks=(name,),
+        contact=(family,),
+        estimators=("zobg", "fobg"),
+        samples=(BATCH,),
+        reference_samples=BATCH,
+        **given,
+    )
+    zeroth, first = rows_of(run_study(about))
+    return {
+        "verdict": first.bias_verdict,
+        "p": first.bias_p_value,
+        "error": first.relative_error,
+        "uncertainty": first.reference_uncertainty,
+        "variances": first.variance / zeroth.variance,
+        "residual": first.residual,
+        "bad": first.unconverged + first.nonfinite + zeroth.nonfinite,
     }
 
 
