@@ -34,7 +34,19 @@ from experiments.laws.measure import (
     sampled,
     trained,
 )
-from experiments.laws.page import CELLS, CHECKED, CHECKS, CORNER, LAWS, PYRAMIDAL, RIGID, ZEROTH, measured, tables
+from experiments.laws.page import (
+    CELLS,
+    CHECKED,
+    CHECKS,
+    CORNER,
+    LAWS,
+    PYRAMIDAL,
+    RIGID,
+    TOSSES,
+    ZEROTH,
+    measured,
+    tables,
+)
 from experiments.pages import write_tables
 from mjx_study.runtime import configure
 from mjx_study.simulation.law import LAWS as OTHERS
@@ -60,6 +72,7 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
         found[f"throw, kappa {scale:g}", row] = partial(integrated, "throw", row, "none", scale)
     for scene, (row, each) in itertools.product(MORE, LAWS.items()):
         found[scene, row] = partial(sampled if scene in SAMPLED else integrated, scene, *each)
+    found |= {(scene, row): partial(integrated, scene, *LAWS[row]) for scene, row in TOSSES}
     for row, scale in itertools.product(("kelvin_voigt", "conic"), (0.1, 10.0)):
         found[f"throw, kappa {scale:g}", row] = partial(integrated, "throw", row, "none", scale)
     for row in (*LAWS, RIGID):

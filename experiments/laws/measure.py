@@ -19,7 +19,7 @@ import mjx_study as study
 from estimators import NOISES, first_order, zeroth_order
 from experiments.laws.page import RIGID
 from experiments.laws.scenes import SCENES, SPEED, throw
-from mjx_study.choices import DEFAULT_SOLREF, FAMILIES
+from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.gradcheck import gradcheck, plan_gradcheck
@@ -35,6 +35,7 @@ from mjx_study.simulation.contact import (
 )
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.engine import engine_model
+from mjx_study.simulation.law import make_law
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
@@ -69,6 +70,13 @@ def member(task: Task, family: str, scale: float = 1.0) -> ContactModel:
     return family_model(family, task.scene, smoothing=of.smoothing * scale or None, **given)
 
 
+def unmapped(family: str) -> ContactModel:
+    """Return a law of MuJoDiCo with MuJoCo's default solref as it stands, which the package reads in its own way, or
+    MuJoCo's default."""
+    law = make_law(family, FAMILIES[family].smoothing) if FAMILIES[family].smoothing else None
+    return ContactModel(jnp.array(DEFAULT_SOLREF), jnp.array(DEFAULT_SOLIMP), law=law)
+
+
 @cache
 def line(scene: str, onset: str) -> tuple[Task, Line]:
     """A scene's task, and its cost and derivative, compiled once for all contacts of a law."""
@@ -79,7 +87,8 @@ def line(scene: str, onset: str) -> tuple[Task, Line]:
 def integrated(scene: str, family: str, onset: str, scale: float = 1.0) -> dict[str, Any]:
     """Slope of the mean cost, mean of the derivative, their errors, deviations of one sample, and time."""
     task, costs = line(scene, onset)
-    contact, position = member(task, family, scale), np.asarray(task.theta, float)
+    contact = unmapped(family) if scene.startswith("toss") else member(task, family, scale)
+    position = np.asarray(task.theta, float)
     count = POINTS if task.scene.host.nv < MANY_JOINTS else POINTS // 4
     points = grid(position[0], position[0], task.sigma, count, task.noise)
     values, slopes = costs(points, contact)

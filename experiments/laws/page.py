@@ -24,6 +24,12 @@ LAWS: Final = {
 MEANS: Final = ("throw", "ball_wall", "skid", "corners", "box", "pusher", "tennis", "landing")
 BODIES: Final = ("roll", "stack", "stacked_corners", "quadruped standing", "quadruped landing")
 KAPPAS: Final = ("throw, kappa 0.1", "throw", "throw, kappa 10")
+TOSSES: Final = tuple(
+    (f"toss {step} ms", row)
+    for row in ("MuJoCo's default", "with the onset term", *OTHERS)
+    for step in (("5", "2", "0.5") if row not in OTHERS else ("5", "2"))
+)
+"""Scene and row of the lines of the table `toss`."""
 RIGID: Final = "rigid"
 """In place of a law: the C engine's limit of stiff contact and short steps."""
 ZEROTH: Final = "MuJoCo's default, zeroth order"
@@ -90,6 +96,12 @@ def tables() -> dict[str, str]:
         "lands down to [mm]": lambda of: f"{1e3 * of['lowest']:.1f}",
         "and goes [mm]": lambda of: f"{1e3 * of['way']:.0f}",
     }
+    tossed: dict[str, Callable[[dict[str, Any]], str]] = {
+        "slope": lambda of: f"{of['slope']:.4f}",
+        "E[FoBG]": lambda of: f"{of['first']:.4f}",
+        "deviation": lambda of: f"{of['first_sd']:.2g}",
+    }
+    tosses = [[row, scene.split()[1], *(cell(scene, row, say) for say in tossed.values())] for scene, row in TOSSES]
     usual = found["throw", "MuJoCo's default"]["seconds"]
     first: dict[tuple[str, str], Callable[[dict[str, Any]], str]] = {
         ("throw", "a ball lands"): bias,
@@ -154,6 +166,7 @@ def tables() -> dict[str, str]:
         "summary": (("law", *(name for _, name in first)), summary),
         "means": (("law", *MEANS, "ms per gradient"), means),
         "motion": (("law", *stands), motion),
+        "toss": (("law", "step [ms]", *tossed), tosses),
         "bodies": (("law", *BODIES), more),
         "deviations": (("law", *MEANS), spreads),
         "fidelity": (("law", *says), fidelity),
