@@ -67,7 +67,7 @@ def jump_table(table: Table) -> str:
     rows = []
     for name in TASKS:
         part = table[bodies_meet(table) & (table.task == name)]
-        jumps = part.strength > SMOOTH_SHARE
+        jumps = part.jump > SMOOTH_SHARE
         rows.append([f"`{name}`"])
         for selected in (part[~jumps], part[jumps]):
             rows[-1] += [share(selected.fobg_off.dropna().to_numpy() == 1), int(selected.fobg_off.isna().sum())]

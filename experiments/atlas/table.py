@@ -11,6 +11,8 @@ import pandas as pd
 
 from estimators import ENOUGH_EFFECTIVE
 from experiments.atlas.design import CELLS
+from mjx_study.choices import DEFAULT_SOLIMP
+from mjx_study.choices import FAMILIES as CONTACTS
 from mjx_study.diagnose.advice import SMOOTH_SHARE, WIDTH_RATIO
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
 
@@ -27,6 +29,7 @@ GROUPS: Final = {
     "h_b": ("h b", "damping over one step"),
     "h2_k": ("h^2 k", "stiffness over one step"),
     "impedance": ("d_0", "impedance at first touch"),
+    "jump": ("h b d_0 / d_width", "share of the approach speed that the damper takes in the first step"),
     "strength": ("onset strength", "share of the approach speed that an onset takes in one step"),
     "travel": ("h v / width", "travel in one step over the depth of the impedance's rise"),
     "crossing": ("h v / spread", "one step over the spread of the first onset: 1 / onset_spread"),
@@ -54,6 +57,8 @@ def read(path: Path, laws: bool = False) -> Table:
     table["h2_k"] = table.timestep**2 * table.k
     table["limit"] = (table.h2_k + 2 * table.h_b) / 4
     table["strength"] = table.onset_strength
+    impedances = [CONTACTS[name].solimp or DEFAULT_SOLIMP for name in table.contact]
+    table["jump"] = table.h_b * table.impedance / np.array(impedances)[:, 1]
     table["travel"] = table.timestep * table.speed / table.width
     table["crossing"] = 1 / table.onset_spread
     table["periods"] = duration * np.sqrt(table.k) / (2 * np.pi)
@@ -107,7 +112,7 @@ def plain_is_off(table: Table) -> Any:
 
 def term_acts(table: Table) -> Any:
     """Select those of them where force jumps, so that the onset term adds something."""
-    return plain_is_off(table) & (table.strength > SMOOTH_SHARE)
+    return plain_is_off(table) & (table.jump > SMOOTH_SHARE)
 
 
 def on_tasks(where: Callable[[Table], Any], *tasks: str) -> Callable[[Table], Any]:
@@ -174,7 +179,7 @@ FORCES: Final = ("pusher", "pusher_apart", "sliding_box")
 RULES: Final = (
     Rule("unstable step: variance above; launch angle", "limit", 1.0, "above", on_tasks(anywhere, *LAUNCHED)),
     Rule("unstable step: variance above; many forces", "limit", 1.0, "above", on_tasks(anywhere, *FORCES)),
-    Rule("force jumps at first touch: mean off", "strength", SMOOTH_SHARE, "fobg_off", bodies_meet),
+    Rule("force jumps at first touch: mean off", "jump", SMOOTH_SHARE, "fobg_off", bodies_meet),
     Rule(
         "smooth onset, travel over width: variance above",
         "travel",

@@ -22,7 +22,7 @@ MOST_UNCERTAINTY: Final = 0.2
 """Relative uncertainty beyond which a reference is too imprecise to judge errors."""
 ERROR_PER_STRENGTH: Final = 0.5
 """Error of the linear onset term's mean, as a share of what the term adds, over the onset strength. Among 11 contact
-models on momentum_transfer and ball_wall the largest was 0.44; at random thetas the atlas has larger ones, at grazing
+models on momentum_transfer and ball_wall the largest was 0.26; at random thetas the atlas has larger ones, at grazing
 contacts, at corners, or where an onset is stronger than `MOST_STRENGTH`."""
 MOST_STRENGTH: Final = 0.9
 """Onset strength up to which `ERROR_PER_STRENGTH` holds; where an onset removes more of the approach speed in one step,

@@ -5,6 +5,7 @@ corners that are at most `SKIN` higher than the deepest one: such a corner has a
 larger of the two. At zero of the second, a corner appears or vanishes in penetration.
 """
 
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import ELLIPTIC, Qvel, Rows, Scalar, row_force
-from mjx_study.simulation.patches import AT_FIRST_TOUCH, RELAXING, patched
+from mjx_study.simulation.patches import AT_FIRST_TOUCH, DAMPER, SPRING, Place, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
 SKIN: Final = 1e-3
@@ -186,11 +187,17 @@ def at_first_touch(model: mjx.Model, data: mjx.Data, members: Rows) -> mjx.Data:
     return changed
 
 
-def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Rows) -> Scalar:
-    """max(b, sqrt(k d)) [1/s] of a guard with these weights at first touch: the rate at which contact slows it down.
+def relaxation_rates(model: mjx.Model, data: mjx.Data, normal: Rows) -> tuple[Scalar, Scalar]:
+    """b and sqrt(k d_0 / d_width) [1/s] of a guard: the rates at which its damper and its spring slow it down.
 
-    The data are at the position stage, with a velocity at which the guard moves.
+    Args:
+        data: at the position stage, with a velocity at which the guard moves.
+        normal: the guard's weights.
     """
-    with patched(RELAXING):
-        rows: Any = mjx.make_constraint(model, data)._impl
-    return -(normal @ rows.efc_aref) / (normal @ (rows.efc_J @ data.qvel))
+
+    def rate(stage: Mapping[Place, Callable[..., Any]]) -> Scalar:
+        with patched(stage):
+            rows: Any = mjx.make_constraint(model, data)._impl
+        return -(normal @ rows.efc_aref) / (normal @ (rows.efc_J @ data.qvel))
+
+    return rate(DAMPER), rate(SPRING)

@@ -282,7 +282,7 @@ def onset_term(
     moving: Moving = MappingProxyType({}),
 ) -> tuple[Terms, Scalar, Bool[Array, ""], Bool[Array, ""], Scalar]:
     """Term of an event, share of the approach speed lost (see `OnsetCounts`), whether D was bounded, and whether the
-    contact begins or ends by motion within the step; zeros and False otherwise. Last, `guards.relaxation_rate`.
+    contact begins or ends by motion within the step; zeros and False otherwise. Last, its relaxation rate.
 
     Delta is v'(on) - v'(off) at first touch, and n the derivative of the guard's distance over the nv coordinates, then
     over the entries of the model's moving leaves.
@@ -311,7 +311,7 @@ def onset_term(
     if moving:
         positioned = fwd_position(model, template.replace(qpos=touch.qpos))
         slope = jnp.concatenate([normal, slope_over(moving, model, positioned, qvel, event)])
-    strength = jnp.maximum(-model.opt.timestep * (normal @ jump) / cell, (model.opt.timestep * found.rate) ** 2)
+    strength = jnp.maximum(-model.opt.timestep * (normal @ jump) / cell, (model.opt.timestep * found.spring) ** 2)
     term = Terms(last * jump / cell, earlier * jump / cell, slope)
     term, strength = jax.tree.map(lambda each: jnp.where(valid, each, 0.0), (term, strength))
     return term, strength, valid & (jnp.abs(touch.travel) < least), valid, found.rate
@@ -361,7 +361,7 @@ class Passages(NamedTuple):
         qvel, act: velocity and activations after them.
         qacc: acceleration in them.
         normal: derivative of the guard's distance.
-        rate: see `guards.relaxation_rate`.
+        rate, spring: the larger of `guards.relaxation_rates`, and the spring's.
         deep: as in `guards.Guards`.
     """
 
@@ -370,6 +370,7 @@ class Passages(NamedTuple):
     qacc: Float[Array, "*cases 2 nv"]
     normal: Float[Array, "*cases nv"]
     rate: Float[Array, "*cases"]
+    spring: Float[Array, "*cases"]
     deep: Bool[Array, "*cases"]
 
 
@@ -403,8 +404,9 @@ def passages(
 
     on, off = step(guard.absent, warmstart[0]), step(guard.absent + guard.members, warmstart[1])
     qvel, act, qacc = (jnp.stack(each) for each in zip(on, off, strict=True))
-    rate = guards.relaxation_rate(model, positioned.replace(qvel=closing), guard.weights)
-    return Passages(qvel, act, qacc, guard.weights @ rows.efc_J, rate, guard.deep)
+    damper, spring = guards.relaxation_rates(model, positioned.replace(qvel=closing), guard.weights)
+    rate = jnp.maximum(damper, spring)
+    return Passages(qvel, act, qacc, guard.weights @ rows.efc_J, rate, spring, guard.deep)
 
 
 def least_travel(model: mjx.Model, found: Passages, ends: Bool[Array, ""]) -> Scalar:

@@ -64,10 +64,20 @@ def _touching(model: mjx.Model, solref: Array, solimp: Array, position: Array) -
     return jnp.zeros_like(k), b, impedance
 
 
-def _relaxing(model: mjx.Model, solref: Array, solimp: Array, position: Array) -> tuple[Array, Array, Array]:
-    """The same with the row's relaxation rate instead of its damping."""
-    k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
-    return jnp.zeros_like(k), jnp.maximum(b, jnp.sqrt(k * impedance)), impedance
+def _damper(model: mjx.Model, solref: Array, solimp: Array, position: Array) -> tuple[Array, Array, Array]:
+    """The same with a damping of b, as in `simulation.contact`."""
+    k, b, impedance = _touching(model, solref, solimp, position)
+    return k, b * _width_impedance(solimp), impedance
+
+
+def _spring(model: mjx.Model, solref: Array, solimp: Array, position: Array) -> tuple[Array, Array, Array]:
+    """The same with a damping of sqrt(k s), as in `simulation.contact`."""
+    k, _, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
+    return jnp.zeros_like(k), jnp.sqrt(k * impedance * _width_impedance(solimp)), impedance
+
+
+def _width_impedance(solimp: Array) -> Array:
+    return jnp.clip(solimp[1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
 
 
 def rotation_vector(quaternion: Float[Array, " 4"]) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
@@ -216,7 +226,8 @@ _ORIGINAL: Final[dict[Place, Any]] = {place: getattr(_module(place[0]), place[1]
 """MJX's own functions; `patched` checks that there are all of them."""
 AT_FIRST_TOUCH: Final = {("constraint", "_kbi"): _touching}
 """Gives every active constraint row its values at first touch."""
-RELAXING: Final = {("constraint", "_kbi"): _relaxing}
+DAMPER: Final = {("constraint", "_kbi"): _damper}
+SPRING: Final = {("constraint", "_kbi"): _spring}
 """Makes every active row's reference acceleration minus its relaxation rate times its velocity."""
 
 _CHOSEN: Final = jax.make_user_context(())

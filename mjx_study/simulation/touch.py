@@ -22,7 +22,8 @@ LEAST: Final = 8
 """Number of events of a contact in a row from which it chatters: a ball in a corner rarely has as many."""
 CHATTER: Final = 2.2
 """Time between two events of a contact below which they belong together, in the time that contact takes to slow a body
-down, 1 / `guards.relaxation_rate`: a little more than `solref`'s time constant where damping is critical."""
+down, one over the larger of `guards.relaxation_rates`: a little more than `solref`'s time constant where damping is
+critical."""
 
 LONG_AGO: Final = 1_000_000
 """Steps before the first event of a contact."""
@@ -41,8 +42,8 @@ class OnsetCounts:
         bounded: onsets and ends at grazing speed, whose term is bounded.
         missed: events left uncorrected, for lack of slots or because their contact chatters (`Events.chattering`).
         strength: root-mean-square share of the approach speed that a corrected onset removes in one step, by the force
-            at touch or by the spring at the depth of a step, h^2 k d, whichever is more; 0 if there is none, and with
-            the jump, whose error does not depend on it.
+            at touch or by the spring at the depth of a step, h^2 k d_0 / d_width, whichever is more; 0 if there is
+            none, and with the jump, whose error does not depend on it.
         first: step of the first onset; NaN if there is none.
         replaced: contact points of corners and edges that appear or vanish without their distance passing zero, for
             which there is no term.
