@@ -224,21 +224,22 @@ class Compiled:
 
 
 class Builds:
-    """Programs that are compiled side by side, while this thread traces the next one."""
+    """Programs that are compiled side by side, while this thread traces the next one; options are those of XLA."""
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(available_cores(), thread_name_prefix="compile")
-        self._running: list[Future[None]] = []
+    def __init__(self, threads: int | None = None, options: dict[str, Any] | None = None) -> None:
+        self._pool = ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="compile")
+        self._options, self._running = options, list[tuple[Compiled, Future[None]]]()
 
     def start(self, program: Compiled, *types: Any) -> None:
         """Trace a program, and begin to compile it for JAX's default device; see `Compiled.ahead`."""
-        self._running.append(self._pool.submit(program.ahead(*types)))
+        self._running.append((program, self._pool.submit(program.ahead(*types, options=self._options))))
 
-    def wait(self) -> None:
-        """Wait for all programs, so that what is timed afterwards has the machine to itself."""
+    def wait(self, program: Compiled | None = None) -> None:
+        """Wait for one program, or all, so that what is timed afterwards has the machine to itself."""
         with awaited():
-            while self._running:
-                self._running.pop(0).result()
+            for each in [each for each in self._running if program in (None, each[0])]:
+                self._running.remove(each)
+                each[1].result()
 
 
 def _calling(libraries: Iterable[str]) -> list[jax.export.DisabledSafetyCheck]:

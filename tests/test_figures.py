@@ -13,8 +13,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from mjx_study._matplotlib import matplotlib
-from mjx_study.plots.edges import UNDRAWN
-from mjx_study.plots.panels import UNSTABLE
+from mjx_study.plots.panels import UNDRAWN, UNSTABLE
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import STYLES, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report

@@ -3,6 +3,7 @@
 import builtins
 import dataclasses
 import json
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from mjx_study.options.configuration import StudyConfig
 from mjx_study.simulation import dynamics
 from mjx_study.simulation.contact import apply_contact, cone_edges, effective_mass, family_model
 from mjx_study.simulation.dynamics import State, step
-from mjx_study.simulation.law import LAWS
+from mjx_study.simulation.law import LAWS, MujodicoLaw
 from mjx_study.simulation.scene import Scene, put_scene
 from mjx_study.tasks import make_task
 
@@ -124,6 +125,47 @@ def test_a_sweep_over_laws_resumes_to_the_same_numbers(tmp_path: Path) -> None:
     assert again.attrs["computed_cells"] == 2
     for name in ("variance", "gradient_norm", "relative_error", "residual"):
         np.testing.assert_array_equal(again[name], whole[name])
+
+
+def miss(document: dict[str, Any]) -> float:
+    """Largest distance of E[FoBG] from the slope of the mean cost, over the steepest."""
+    slope, first = (np.array(document["curves"][-1][name]) for name in ("exact_slope", "exact_first"))
+    return np.abs(first - slope).max() / np.abs(slope).max()
+
+
+@pytest.mark.parametrize(
+    ("command", "measured", "low", "high"),
+    [
+        ("compare --estimators fobg --samples 20", lambda found: found["rows"][0]["relative_error"], 0.0, 0.1),
+        (
+            "optimise --estimators fobg",
+            lambda found: found["start_cost"][0] / found["runs"][0]["final_cost"][0],
+            0,
+            0.9,
+        ),
+        ("landscape --points 5", miss, 0.0, 0.05),
+        ("rollout", lambda found: found["cost"], -1.0, -1e-4),
+    ],
+)
+def test_every_command_takes_a_law(
+    command: str,
+    measured: Callable[[dict[str, Any]], float],
+    low: float,
+    high: float,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A ball hits a bar under it, so that the cost is below zero."""
+    monkeypatch.chdir(tmp_path)
+    used, own = [], MujodicoLaw.equations
+    monkeypatch.setattr(MujodicoLaw, "equations", lambda law, scene: used.append(law.name) or own(law, scene))
+    name, *options = command.split()
+    law = "momentum_transfer --contact kelvin_voigt --stiffness 10000 --horizon 200 --json".split()
+    assert cli.main([name, *law, *options]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert set(used) == {"kelvin_voigt"} and not document["warnings"]
+    assert low <= measured(document) < high
 
 
 @pytest.mark.parametrize("most", [9, 20_000], ids=["as it is", "as a graph"])

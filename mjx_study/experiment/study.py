@@ -25,10 +25,9 @@ from mjx_study.identity import contents, estimator_contents
 from mjx_study.options.configuration import Settings, StudyConfig
 from mjx_study.results.kind import StudyResults, find_kind
 from mjx_study.table import digits_to_tell_apart
-from mjx_study.tasks import TASKS
+from mjx_study.tasks import TASKS, registered_name
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Recipe, Task
-from mjx_study.tasks.user_task import registered_name
 
 Result = TypeVar("Result")
 
