@@ -132,7 +132,7 @@ def _in_folder(
     if unwritten is not None:
         dataset.attrs["unwritten"] = f"cannot write to {store.folder}: {unwritten.strerror or unwritten}"
     if failed:
-        dataset.attrs["failed_cells"] = json.dumps({cells.label(index): why for index, why in failed.items()})
+        dataset.attrs["failed_cells"] = json.dumps({cells.label(index): why for index, why in sorted(failed.items())})
     return dataset.assign_attrs(computed_cells=computed)
 
 
