@@ -67,7 +67,7 @@ def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("from tests.carts import cart\n")
     compare = "compare mine:cart --contact mjcf --samples 20 --reference-samples 20"
     optimise = "optimise mine:cart --iterations 2 --samples 8 --learning-rate 0.1 --evaluation-samples 20 --seeds 2"
-    first, again, others, line, descents, later = builds_of(
+    first, again, others, line, descents, later, more = builds_of(
         tmp_path,
         compare,
         compare,
@@ -75,15 +75,18 @@ def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
         "landscape mine:cart --samples 20 --points 3",
         optimise,
         optimise,
+        optimise.replace("samples 8 --learning-rate 0.1", "samples 9 --learning-rate 0.2").replace(
+            "seeds 2", "seeds 3 --seed 4"
+        ),
     )
     assert sorted(set(first["built"]) & LARGE) == ["gradient", "numbers_of_seeds", "value"]
-    for found in (first, again, others, line, descents, later):
+    for found in (first, again, others, line, descents, later, more):
         large = [name for name in found["built"] if name in LARGE]
         descents_of_three_estimators = 2 * ("descent" in large)
         assert len(large) == len(set(large)) + descents_of_three_estimators, large
-    assert again["built"] == others["built"] == later["built"] == []
+    assert again["built"] == others["built"] == later["built"] == more["built"] == []
     assert first["traced"] and descents["traced"]
-    for found in (again, others, line, later):
+    for found in (again, others, line, later, more):
         assert not LARGE & {*found["built"]} and not found["traced"], found
     assert {name for name in descents["built"] if name in LARGE} == {"descent"}
 

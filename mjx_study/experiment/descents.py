@@ -19,14 +19,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from estimators import Estimator, draw
 from estimators.sampling import draw_at, sample_keys
 from mjx_study.compiled import Builds, Compiled
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
-from mjx_study.experiment.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
-from mjx_study.experiment.memory import check_memory
+from mjx_study.experiment.iteration import (
+    Descent,
+    Record,
+    advance,
+    advance_one,
+    begin,
+    going,
+    if_going,
+    make_optimizer,
+    optimizer_of,
+    schedule_factors,
+)
+from mjx_study.experiment.memory import check_memory, padded_seeds
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
@@ -172,7 +183,8 @@ class Backend:
         group, config = plan.groups[cell.group], plan.config
         self.task, self.recipe, self.samples = group.task.replace(sigma=cell.sigma), group.descent, cell.samples
         self.config, self.seeds = config, config.seeds
-        self.optimizer = make_optimizer(config.settings.optimizer, self.recipe.learning_rate, self.recipe.decay)
+        self._rates = np.array(self.recipe.learning_rate), np.array(self.recipe.decay)
+        self.optimizer = make_optimizer(config.settings.optimizer, *map(float, self._rates))
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
         evaluation = chunk_for(config.settings.evaluation_samples, local_devices(), [self.task])
         chunk = plan.chunk_size if config.chunk_size else evaluation
@@ -182,6 +194,7 @@ class Backend:
         iterations = self.recipe.iterations
         self._stiffness = schedule_factors(config.stiffness_schedule, iterations, most=1.0)
         self._sigma = self.task.sigma * schedule_factors(config.sigma_schedule, iterations)
+        self._padded = plan.padded_samples(cell)
         self._iterations: dict[Estimator, Callable[..., tuple[Descent, Record]]] = {}
 
     @property
@@ -190,11 +203,16 @@ class Backend:
         return 1 if self.simulator is None else len(self.simulator.devices)
 
     @property
+    def rows(self) -> int:
+        """Number of rows of a state: one for each seed, and others that have stopped."""
+        return padded_seeds(self.seeds) if self._in_turn else self.seeds
+
+    @property
     def _in_turn(self) -> bool:
-        """Whether an iteration takes seeds in turn, so that any number of them and of samples shares the traces of
-        rollouts: where these are native code, which gains nothing from larger batches."""
+        """Whether a program takes seeds in turn, so that it serves any number of them and of samples, up to a size:
+        where rollouts are native code, which gains nothing from larger batches."""
         on_host = jax.default_backend() == "cpu" and computes_steps() == "native"
-        return on_host and self.task.scene.uses_graph
+        return self.simulator is not None and on_host and self.task.scene.uses_graph
 
     def place(self, state: Descent, index: int) -> Descent:
         """Put the state of an estimator on its device; on CPUs always the first, see `spread`."""
@@ -213,16 +231,25 @@ class Backend:
 
         if (simulator := self.simulator) is not None:
             if estimator not in self._iterations:
+                name, size = self.config.settings.optimizer, self._padded if self._in_turn else self.samples
 
-                def simulated_update(contact, sigma, state: Descent, keys):
-                    objective = TracedObjective(simulator, contact, sigma, batched=not self._in_turn)
-                    batches = partial(draw, estimator.needs, objective, num_samples=self.samples)
-                    if self._in_turn:
-                        return update(state, jax.lax.map(lambda each: batches(*each), (state.theta, keys)))
-                    return update(state, jax.vmap(batches)(state.theta, keys))
+                def in_turn(contact, sigma, state: Descent, keys, rates, samples):
+                    objective = TracedObjective(simulator, contact, sigma, batched=False, samples=samples)
 
-                made_of = "descent", estimator, self.optimizer, self.task, self.samples, simulator.chunk_size
-                self._iterations[estimator] = Compiled(simulated_update, *made_of)
+                    def one_seed(state, key):
+                        drawn = draw(estimator.needs, objective, state.theta, key, size)
+                        return advance_one(state, drawn, estimator, optimizer_of(name, *rates), samples)
+
+                    return jax.lax.map(lambda each: if_going(one_seed, *each), (state, keys))
+
+                def all_seeds(contact, sigma, state: Descent, keys, rates):
+                    objective = TracedObjective(simulator, contact, sigma)
+                    batches = partial(draw, estimator.needs, objective, num_samples=size)
+                    drawn = jax.vmap(batches)(jnp.asarray(state.theta), keys)
+                    return advance(state, drawn, estimator, optimizer_of(name, *rates))
+
+                made_of = "descent", estimator, name, self.task, size, simulator.chunk_size
+                self._iterations[estimator] = Compiled(in_turn if self._in_turn else all_seeds, *made_of)
             simulated = self._iterations[estimator]
             return lambda *arguments: simulated(*self._on_device(model, *arguments))
         compiled = self._iterations.setdefault(estimator, jax.jit(update))
@@ -232,17 +259,26 @@ class Backend:
             task = self.task.replace(sigma=float(self._sigma[index]))
             reference = task.analytic(model.stiffness_or_zero * float(self._stiffness[index]))
             groups = [slice(first, first + count) for first in range(0, self.seeds, count)]
-            parts = [self._together(estimator.needs, reference, state.theta[some], keys[some]) for some in groups]
+            theta = jnp.asarray(state.theta)
+            parts = [self._together(estimator.needs, reference, theta[some], keys[some]) for some in groups]
             return compiled(state, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
 
         return on_host
 
-    def build(self, estimator: Estimator, builds: Builds, model: ContactPoint, *arguments: Any) -> None:
+    def build(
+        self,
+        estimator: Estimator,
+        builds: Builds,
+        model: ContactPoint,
+        state: Descent,
+        keys: Key[Array, " seeds"],
+        index: int,
+    ) -> None:
         """Trace the program of `iteration` for its arguments and begin to compile it, where it is one for all
         devices."""
         program = self._iterations[estimator]
         if isinstance(program, Compiled) and jax.default_backend() == "cpu":
-            builds.start(program, *self._on_device(model, *arguments))
+            builds.start(program, *self._on_device(model, state, keys, index))
 
     def build_evaluation(self, model: ContactPoint, builds: Builds) -> None:
         """Begin to compile the program of `cost`."""
@@ -253,7 +289,8 @@ class Backend:
         """Arguments of a simulated iteration."""
         factor, contact = self._stiffness[index], model.contact
         contact = contact if contact is None or factor == 1 else soften(contact, factor)
-        return contact, self._sigma[index], state, keys
+        samples = (np.asarray(self.samples),) if self._in_turn else ()
+        return contact, self._sigma[index], state, keys, self._rates, *samples
 
     def _together(
         self,
@@ -321,7 +358,7 @@ class _Run:
     def __post_init__(self) -> None:
         """Begin at the start, or restore a run from its checkpoint."""
         backend, index = self.backend, self.index
-        self.state = begin(backend.optimizer, backend.task.theta, backend.seeds)
+        self.state = begin(backend.optimizer, backend.task.theta, backend.seeds, backend.rows)
         self.records: list[Record] = []
         self.seconds: list[float] = []
         if f"seconds_{index}" in self.kept:
@@ -329,15 +366,12 @@ class _Run:
                 self._restore()
         self.already = len(self.records)
         self.state = backend.place(self.state, index)
-        seeds = jnp.arange(backend.seeds)
-        keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(backend.config.seed), seed))(seeds)
-        fold_in = jax.vmap(jax.random.fold_in, (0, None))
-        self._keys_of = jax.jit(lambda iteration: fold_in(jax.random.clone(keys), iteration))
+        self._keys_of = partial(_keys, backend.config.seed, seeds=backend.rows)
         self._iterate = backend.iteration(self.estimator, self.model)
 
     @property
     def _goes_on(self) -> bool:
-        return self.already < self.backend.recipe.iterations and bool(jnp.any(going(self.state)))
+        return self.already < self.backend.recipe.iterations and bool(np.any(going(self.state)))
 
     def build(self, builds: Builds) -> None:
         """Begin to compile an iteration."""
@@ -358,11 +392,15 @@ class _Run:
                 raise ValueError(f"{name} has shape {array.shape} and type {array.dtype}")
             return array
 
-        state = [kept(f"state_{self.index}_{i}", leaf.shape, leaf.dtype.kind) for i, leaf in enumerate(leaves)]
+        state = [
+            kept(f"state_{self.index}_{i}", (self.backend.seeds, *leaf.shape[1:]), leaf.dtype.kind)
+            for i, leaf in enumerate(leaves)
+        ]
         each = length, self.backend.seeds
         columns = [kept(f"history_{self.index}_{name}", each, "f") for name in HISTORY]
-        self.state = structure.unflatten(map(jnp.asarray, state))
-        self.records += [Record(*map(jnp.asarray, row)) for row in zip(*columns, strict=True)]
+        whole = [np.concatenate([rows, leaf[len(rows) :]]) for rows, leaf in zip(state, leaves, strict=True)]
+        self.state = structure.unflatten(whole)
+        self.records += [Record(*row) for row in zip(*columns, strict=True)]
         self.seconds += map(float, kept(f"seconds_{self.index}", (length,), "f"))
 
     def descend(self) -> None:
@@ -371,7 +409,7 @@ class _Run:
         if self._goes_on:  # the first call takes longer; its result is discarded
             jax.block_until_ready(self._iterate(self.state, self._keys_of(done), done))
         last = saved = time.perf_counter()
-        while done < iterations and (pending or bool(jnp.any(going(self.state)))):
+        while done < iterations and (pending or bool(np.any(going(self.state)))):
             self.state, record = self._iterate(self.state, self._keys_of(done), done)
             pending.append(record)
             done += 1
@@ -400,7 +438,7 @@ class _Run:
 
     def _collect(self, pending: list[Record], since: float) -> float:
         """Fetch records from the device, and return when they arrived."""
-        self.records += jax.device_get(pending)
+        self.records += jax.tree.map(lambda leaf: leaf[: self.backend.seeds], jax.device_get(pending))
         now, elapsed = time.perf_counter(), self.seconds[-1] if self.seconds else 0.0
         self.seconds += [elapsed + (now - since) * (place + 1) / len(pending) for place in range(len(pending))]
         pending.clear()
@@ -408,11 +446,15 @@ class _Run:
 
     def _save(self) -> None:
         with self.backend.saving:
-            leaves = jax.tree.leaves(self.state)
-            self.kept.update({f"state_{self.index}_{leaf}": np.asarray(value) for leaf, value in enumerate(leaves)})
+            leaves = jax.tree.leaves(self._state_of_seeds)
+            self.kept.update({f"state_{self.index}_{leaf}": value for leaf, value in enumerate(leaves)})
             self.kept.update({f"history_{self.index}_{name}": values for name, values in self._history().items()})
             self.kept[f"seconds_{self.index}"] = np.array(self.seconds)
             self.checkpoint.save(dict(self.kept))
+
+    @property
+    def _state_of_seeds(self) -> Descent:
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: self.backend.seeds], self.state)
 
     def _history(self) -> dict[str, Float[np.ndarray, "iterations seeds"]]:
         shape = len(self.records), self.backend.seeds
@@ -422,14 +464,15 @@ class _Run:
 
     def numbers(self) -> dict[str, np.ndarray]:
         """Numbers of the run, once it has ended."""
-        backend, history = self.backend, self._history()
-        costs = [backend.cost(theta, self.model) for theta in self.state.theta]
-        metrics = [backend.metrics(theta, self.model) for theta in self.state.theta]
-        reason = np.asarray(self.state.reason)
+        backend, history, state = self.backend, self._history(), self._state_of_seeds
+        thetas = [jax.device_put(theta) for theta in state.theta]
+        costs = [backend.cost(theta, self.model) for theta in thetas]
+        metrics = [backend.metrics(theta, self.model) for theta in thetas]
+        reason = state.reason
         done = np.sum(~np.isnan(history["nonfinite"]), axis=0)
         found = {name: _padded(values, backend.recipe.iterations) for name, values in history.items()}
         return found | {
-            "theta": np.asarray(self.state.theta),
+            "theta": state.theta,
             "seconds": _padded(np.array(self.seconds), backend.recipe.iterations),
             "stopped_at": np.where(reason > 0, done, np.nan),
             "reason": np.where(reason > 0, reason, np.nan),
@@ -438,6 +481,13 @@ class _Run:
             "rollouts": rollouts_of(self.estimator.needs, backend.samples, backend.task)[0],
             **{METRIC + name: np.array([each[name] for each in metrics]) for name in metrics[0]},
         }
+
+
+@partial(jax.jit, static_argnames="seeds")
+def _keys(seed: Int[Array, ""] | int, iteration: Int[Array, ""] | int, seeds: int) -> Key[Array, " seeds"]:
+    """Keys of an iteration, of seeds that may be more than there are."""
+    first = jax.random.key(seed)
+    return jax.vmap(lambda each: jax.random.fold_in(jax.random.fold_in(first, each), iteration))(jnp.arange(seeds))
 
 
 def _padded(values: np.ndarray, length: int) -> np.ndarray:

@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import inspect
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
@@ -16,6 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 from estimators import Estimator, Linearisation, StepEvaluation
 from estimators.choices import suggestion
 from estimators.pytree import register_pytree
+from mjx_study.experiment.gradient_numbers import estimate_of
+
+AnyArray = Array | np.ndarray
 
 MOST_COST_RATIO: Final = 1e6
 """Ratio of the mean cost to the size of the first one beyond which a run counts as diverged."""
@@ -39,10 +43,10 @@ class Descent:
         first_cost: absolute mean cost of each seed at its first iteration.
     """
 
-    theta: Float[Array, "*seeds params"]
+    theta: Float[AnyArray, "*seeds params"]
     optimizer: Any
-    reason: Int[Array, "*seeds"]
-    first_cost: Float[Array, "*seeds"]
+    reason: Int[AnyArray, "*seeds"]
+    first_cost: Float[AnyArray, "*seeds"]
 
 
 @register_pytree
@@ -53,12 +57,12 @@ class Record:
     alpha is NaN for estimators with a single batch, and the residual 0 for an analytic system.
     """
 
-    cost: Float[Array, "*seeds"]
-    gradient_norm: Float[Array, "*seeds"]
-    variance: Float[Array, "*seeds"]
-    alpha: Float[Array, "*seeds"]
-    nonfinite: Float[Array, "*seeds"]
-    residual: Float[Array, "*seeds"]
+    cost: Float[AnyArray, "*seeds"]
+    gradient_norm: Float[AnyArray, "*seeds"]
+    variance: Float[AnyArray, "*seeds"]
+    alpha: Float[AnyArray, "*seeds"]
+    nonfinite: Float[AnyArray, "*seeds"]
+    residual: Float[AnyArray, "*seeds"]
 
 
 def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.GradientTransformation:
@@ -72,9 +76,8 @@ def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.Gradi
         raise ValueError(f"the decay of the learning rate must be a power from 0 to 2, got {decay}")
     optimizer = None
     with suppress(Exception):  # whatever optax has by this name may raise anything
-        factory = getattr(optax, name)
-        if "learning_rate" in inspect.signature(factory).parameters:
-            made = factory(learning_rate=lambda count: learning_rate / (1.0 + count) ** decay)
+        if "learning_rate" in inspect.signature(getattr(optax, name)).parameters:
+            made = optimizer_of(name, learning_rate, decay)
             theta = jax.ShapeDtypeStruct((2,), float)
             jax.eval_shape(lambda theta: made.update(theta, made.init(theta), theta), theta)
             optimizer = made
@@ -84,6 +87,11 @@ def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.Gradi
         more = suggestion(name, known) or "; use for example sgd, adam or rmsprop"
         raise ValueError(f"optax has no optimiser {name!r} that takes a learning rate{more}")
     return optimizer
+
+
+def optimizer_of(name: str, learning_rate: Any, decay: Any) -> optax.GradientTransformation:
+    """The optimiser of `make_optimizer`, whose numbers may be traced."""
+    return getattr(optax, name)(learning_rate=lambda count: learning_rate / (1.0 + count) ** decay)
 
 
 def schedule_factors(text: str | None, iterations: int, most: float = math.inf) -> Float[np.ndarray, " iterations"]:
@@ -120,11 +128,14 @@ def _evaluate(node: ast.expr) -> Any:
     return ast.literal_eval(node)
 
 
-def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"], seeds: int) -> Descent:
-    """Start all seeds at the same parameters."""
-    thetas = jnp.broadcast_to(theta, (seeds, *theta.shape))
-    first_cost = jnp.full(seeds, jnp.nan, theta.dtype)
-    return Descent(thetas, jax.vmap(optimizer.init)(thetas), jnp.zeros(seeds, int), first_cost)
+def begin(
+    optimizer: optax.GradientTransformation, theta: Float[Array, " params"], seeds: int, rows: int | None = None
+) -> Descent:
+    """Start all seeds at the same parameters, in arrays on the host; any further rows have stopped."""
+    one = Descent(theta, optimizer.init(theta), jnp.zeros((), int), jnp.asarray(jnp.nan, theta.dtype))
+    state = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], rows or seeds, axis=0), one)
+    state.reason[seeds:] = 1
+    return state
 
 
 def advance(
@@ -132,12 +143,26 @@ def advance(
 ) -> tuple[Descent, Record]:
     """Advance every active seed by one iteration, given the batches of the estimator's oracles with a leading axis of
     seeds; return the new state, and the record of the iteration."""
-    return jax.vmap(lambda state, batches: _advance_one(state, batches, estimator, optimizer))(state, batches)
+    return jax.vmap(lambda state, batches: advance_one(state, batches, estimator, optimizer))(state, batches)
 
 
-def _advance_one(state: Descent, batches, estimator, optimizer):
-    estimate = estimator(batches)
+def advance_one(
+    state: Descent,
+    batches: dict[str, Any],
+    estimator: Estimator,
+    optimizer: optax.GradientTransformation,
+    samples: Int[Array, ""] | None = None,
+) -> tuple[Descent, Record]:
+    """Advance a seed as `advance` does; with a number of samples, the rest of the batches is padding."""
     value, residual = _values(batches[estimator.needs[0]])
+    padding = 0
+    if samples is None:
+        estimate = estimator(batches)
+    else:
+        estimate, padding = estimate_of(estimator, batches, samples), len(value) - samples
+        real = jnp.arange(len(value)) < samples
+        value = jnp.where(real, value, jnp.nan)
+        residual = None if residual is None else jnp.where(real, residual, 0.0)
     finite = jnp.isfinite(value)
     cost = jnp.sum(jnp.where(finite, value, 0.0)) / jnp.sum(finite)
     first_cost = jnp.where(jnp.isnan(state.first_cost), jnp.abs(cost), state.first_cost)
@@ -166,10 +191,18 @@ def _advance_one(state: Descent, batches, estimator, optimizer):
         gradient_norm=jnp.linalg.norm(estimate.mean),
         variance=estimate.variance,
         alpha=nan if estimate.alpha is None else estimate.alpha.alpha,
-        nonfinite=estimate.num_nonfinite.astype(theta.dtype),
+        nonfinite=(estimate.num_nonfinite - padding).astype(theta.dtype),
         residual=jnp.zeros((), theta.dtype) if residual is None else jnp.max(residual),
     )
     return following, jax.tree.map(lambda figure: jnp.where(stopped_before, nan, figure), record)
+
+
+def if_going(advance: Callable[..., tuple[Descent, Record]], state: Descent, key: Any) -> tuple[Descent, Record]:
+    """Advance a seed unless it has stopped, in a program that takes seeds in turn."""
+    nothing = jax.tree.map(
+        lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(advance, state, key)[1]
+    )
+    return jax.lax.cond(state.reason == 0, advance, lambda state, _: (state, nothing), state, key)
 
 
 def _values(batch) -> tuple[Float[Array, " samples"], Float[Array, " samples"] | None]:
@@ -179,6 +212,6 @@ def _values(batch) -> tuple[Float[Array, " samples"], Float[Array, " samples"] |
     return (batch.value_to_go[:, 0] if isinstance(batch, StepEvaluation) else batch.value), batch.residual
 
 
-def going(state: Descent) -> Bool[Array, "*seeds"]:
+def going(state: Descent) -> Bool[np.ndarray, "*seeds"]:
     """Which seeds have not stopped."""
-    return state.reason == 0
+    return np.asarray(state.reason) == 0

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from estimators.noise import check_sigma
@@ -255,9 +255,15 @@ class BlankObjective(MjxObjective):
 @dataclasses.dataclass(frozen=True)
 class TracedObjective(MjxObjective):
     """An objective inside a larger compiled program on one device, without returning to the host between batch and
-    estimate. If the program batches it (`batched`), its own programs are traced anew in it."""
+    estimate.
+
+    Attributes:
+        batched: whether the program batches the objective, whose programs are then traced anew in it.
+        samples: number of the keys whose samples are computed; of others, those of whole chunks are zeros.
+    """
 
     batched: bool = True
+    samples: Int[Array, ""] | None = None
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
         simulator = self.simulator
@@ -265,21 +271,29 @@ class TracedObjective(MjxObjective):
         dtype = simulator.task.scene.template.qpos.dtype
         scale = np.ones(len(rows), dtype) if noise_scale is None else np.asarray(noise_scale, dtype)
         chunk = simulator.chunk_size
-        chunks = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1).reshape(-1, chunk)
+        order = np.argsort(rows, stable=True)  # so that few chunks hold all rows of the first samples
+        at = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1)
+        chunks, back = order[at].reshape(-1, chunk), np.argsort(order)
         key_data, sigma = jax.random.key_data(keys), jnp.asarray(self.sigma, dtype)
         kept = simulator._programs[name]
         blank = simulator._chunk(theta, None, 1.0)[-2:]
         program = kept.jitted if self.batched else kept.within(theta, self.contact, sigma, *blank)
 
         def call(chunk):
-            drawn, factor = chunk
-            return program(theta, self.contact, sigma, drawn, factor)
+            drawn, factor, *needed = chunk
+            run = partial(program, theta, self.contact, sigma, drawn, factor)
+            if not needed:
+                return run()
+            blank = lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(run))  # noqa: E731
+            return jax.lax.cond(needed[0], run, blank)
 
         parts = key_data[rows[chunks]], jnp.asarray(scale[chunks])
+        if self.samples is not None and len(chunks) > 1:
+            parts += (jnp.asarray(rows[chunks].min(axis=1)) < self.samples,)
         if len(chunks) == 1:
-            return jax.tree.map(lambda leaf: leaf[: len(rows)], call(jax.tree.map(lambda part: part[0], parts)))
+            return jax.tree.map(lambda leaf: leaf[back], call(jax.tree.map(lambda part: part[0], parts)))
         outputs = jax.lax.map(call, parts)
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: len(rows)], outputs)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[back], outputs)
 
 
 def _in_turn(outputs: tuple[Any, ...], samples: int, count: int) -> list[tuple[Any, ...]]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_study.compiled import Compiled
-from mjx_study.graph.native import in_numpy
+from mjx_study.graph.native import computes_steps, in_numpy
 from mjx_study.tasks.task import Task
 from mjx_study.watchdog import awaited
 
@@ -20,6 +20,8 @@ CPU_CHUNKS: Final = (11, 101, 201)
 programs; one more than round numbers, for the baseline."""
 MANY: Final = 2000
 """Samples from which a CPU takes the largest chunks, which pay for another program."""
+IN_TURN: Final = (16, 56)
+"""The same in a program that takes batches in turn, as native code in vectors of eight."""
 IN_NUMPY: Final = 2001
 """Samples per call where NumPy stands in for native code, which leaves out copies: an operation takes 0.3 us for 100
 samples, 0.6 for 2,000."""
@@ -74,8 +76,9 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
 def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), *, own_program: bool = False) -> int:
     """Choose the chunk size for `samples` and their baseline.
 
-    On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the middle one for up to `MANY`; for a program of so many
-    samples alone, all that the largest holds; `IN_NUMPY` for half of the middle one or more. On accelerators, the size
+    On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the middle one for up to `MANY`; for a program of such
+    batches alone, one of `IN_TURN`, or, through XLA, all that the largest holds; `IN_NUMPY` for half of the middle one
+    or more. On accelerators, the size
     that needs the fewest calls (at least one per device), evenly filled, with at most as many samples as task gradients
     fit into `MAX_SHARE` of the memory.
     """
@@ -84,6 +87,8 @@ def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), 
         few, some, most = CPU_CHUNKS
         if in_numpy() and samples > some // 2:
             return IN_NUMPY
+        if own_program and computes_steps() == "native" and all(task.scene.uses_graph for task in tasks):
+            return IN_TURN[samples >= IN_TURN[0]]
         if own_program:
             return min(samples + 1, most)
         return few if samples < few else some if samples < MANY else most
