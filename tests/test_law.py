@@ -3,6 +3,7 @@
 import builtins
 import dataclasses
 import json
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 
 import mjx_study as study
 from mjx_study import cli
-from mjx_study.bench import plan_bench, run_bench
+from mjx_study.bench import run_bench
 from mjx_study.choices import laws_of
 from mjx_study.execution.run import run_study
 from mjx_study.graph import scalars
@@ -25,7 +26,7 @@ from mjx_study.options.configuration import StudyConfig
 from mjx_study.simulation import dynamics
 from mjx_study.simulation.contact import apply_contact, cone_edges, effective_mass, family_model
 from mjx_study.simulation.dynamics import State, step
-from mjx_study.simulation.law import LAWS
+from mjx_study.simulation.law import LAWS, MujodicoLaw
 from mjx_study.simulation.scene import Scene, put_scene
 from mjx_study.tasks import make_task
 
@@ -126,6 +127,47 @@ def test_a_sweep_over_laws_resumes_to_the_same_numbers(tmp_path: Path) -> None:
         np.testing.assert_array_equal(again[name], whole[name])
 
 
+def miss(document: dict[str, Any]) -> float:
+    """Largest distance of E[FoBG] from the slope of the mean cost, over the steepest."""
+    slope, first = (np.array(document["curves"][-1][name]) for name in ("exact_slope", "exact_first"))
+    return np.abs(first - slope).max() / np.abs(slope).max()
+
+
+@pytest.mark.parametrize(
+    ("command", "measured", "low", "high"),
+    [
+        ("compare --estimators fobg --samples 20", lambda found: found["rows"][0]["relative_error"], 0.0, 0.1),
+        (
+            "optimise --estimators fobg",
+            lambda found: found["start_cost"][0] / found["runs"][0]["final_cost"][0],
+            0,
+            0.9,
+        ),
+        ("landscape --points 5", miss, 0.0, 0.05),
+        ("rollout", lambda found: found["cost"], -1.0, -1e-4),
+    ],
+)
+def test_every_command_takes_a_law(
+    command: str,
+    measured: Callable[[dict[str, Any]], float],
+    low: float,
+    high: float,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A ball hits a bar under it, so that the cost is below zero."""
+    monkeypatch.chdir(tmp_path)
+    used, own = [], MujodicoLaw.equations
+    monkeypatch.setattr(MujodicoLaw, "equations", lambda law, scene: used.append(law.name) or own(law, scene))
+    name, *options = command.split()
+    law = "momentum_transfer --contact kelvin_voigt --stiffness 10000 --horizon 200 --json".split()
+    assert cli.main([name, *law, *options]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert set(used) == {"kelvin_voigt"} and not document["warnings"]
+    assert low <= measured(document) < high
+
+
 @pytest.mark.parametrize("most", [9, 20_000], ids=["as it is", "as a graph"])
 def test_a_timestep_may_be_a_number(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(SWITCH, "xla")
@@ -157,7 +199,7 @@ def test_the_graph_has_the_packages_own_derivative(law: str, monkeypatch: pytest
 @pytest.mark.slow
 def test_bench_leaves_out_rivals_of_another_law() -> None:
     defaults = study.StudyDefaults(stiffnesses=(100.0,), families=("hunt_crossley",))
-    report = run_bench(plan_bench(make_task("pusher", horizon=3).replace(defaults=defaults), 6))
+    report = run_bench(make_task("pusher", horizon=3).replace(defaults=defaults), 6)
     assert report.contact.startswith("hunt_crossley")
     assert set(report.ratios) == {"gradient_per_value", "onset_per_gradient"}
     assert any("left out" in line for line in report.lines())

@@ -16,6 +16,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -62,15 +63,14 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
         how = ["quick"] * arguments.quick + ["half"] * (arguments.what == "check")
         command = [*pinned, python, "-m", "experiments.engines.worker", *words, *how]
         environment = {**os.environ, **ONE_CORE} if arguments.jobs > 1 else None
-        said, failed = "measured", False
+        said, failed, began = "measured", False, time.perf_counter()
         try:
             done = subprocess.run(
                 command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=True
             )
-            line = done.stdout.splitlines()[-1]
-            json.loads(line)
+            line = json.loads(done.stdout.splitlines()[-1]) | {"seconds": time.perf_counter() - began}
             with writing, target.open("a") as file:
-                file.write(line + "\n")
+                file.write(json.dumps(line) + "\n")
         except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
             said, failed = f"FAILED: {str(error.stderr or error)[-500:]}", True
         print(*words, said, flush=True)

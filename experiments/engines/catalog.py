@@ -18,10 +18,12 @@ class Environment:
     Attributes:
         packages: requirements of pip; empty for this project's own environment.
         python: versions of Python that the packages' wheels exist for, the first that is found is taken.
+        large: what makes it larger than 2 GB, so that it is installed only by name.
     """
 
     packages: tuple[str, ...] = ()
     python: tuple[str, ...] = ("3.11", "3.12")
+    large: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +50,7 @@ class Engine:
     left: str = "not run"
 
 
+CUDA: Final = "torch's wheels for Linux bring CUDA"
 ENVIRONMENTS: Final = {
     "own": Environment(),
     "brax": Environment(("brax==0.14.2", "mujoco-mjx==3.17.0", "mujoco==4.0.0", "jax==0.10.2")),
@@ -57,10 +60,12 @@ ENVIRONMENTS: Final = {
     "newton_1_0": Environment(("newton==1.0.0", "warp-lang==1.12.0")),
     "newton": Environment(("newton==1.8.0", "warp-lang==1.19.0")),
     "jaxsim": Environment(("jaxsim==0.9.0", "jax==0.10.2", "jaxlib==0.10.2")),
-    "nimble": Environment(("nimblephysics==0.10.52.1", "torch==2.14.1", "numpy<2"), ("3.10",)),
+    "nimble": Environment(("nimblephysics==0.10.52.1", "torch==2.14.1", "numpy<2"), ("3.10",), large=CUDA),
     "drake": Environment(("drake==1.58.0",), ("3.12",)),
     "mujoco_torch": Environment(
-        ("mujoco-torch==0.2.0", "mujoco==3.5.0", "torch==2.14.1", "tensordict==0.15.3", "numpy<2"), ("3.12", "3.11")
+        ("mujoco-torch==0.2.0", "mujoco==3.5.0", "torch==2.14.1", "tensordict==0.15.3", "numpy<2"),
+        ("3.12", "3.11"),
+        large=CUDA,
     ),
 }
 ENGINES: Final = {

@@ -1,4 +1,4 @@
-"""Make the environments of the engines, of pinned packages, in build/engines: those named, or all.
+"""Make the environments of the engines, of pinned packages, in build/engines: those named, or all below 2 GB.
 
 python -m experiments.engines.install [ENVIRONMENT ...]
 """
@@ -35,10 +35,17 @@ def install(name: str) -> bool:
     return done
 
 
+def usual() -> list[str]:
+    """Return the environments that need packages and are not large, and say which are."""
+    for name, each in ENVIRONMENTS.items():
+        if each.large:
+            print(f"{name}: left out, more than 2 GB ({each.large}): python -m experiments.engines.install {name}")
+    return [name for name, each in ENVIRONMENTS.items() if each.packages and not each.large]
+
+
 def main() -> None:
     """Run the command line."""
-    names = sys.argv[1:] or [name for name, each in ENVIRONMENTS.items() if each.packages]
-    sys.exit(not all([install(name) for name in names]))
+    sys.exit(not all([install(name) for name in sys.argv[1:] or usual()]))
 
 
 if __name__ == "__main__":

@@ -27,13 +27,26 @@ from experiments.laws.measure import (
     TRAINED,
     bodies,
     checked,
+    compared,
     corner,
     faithful,
     integrated,
     sampled,
     trained,
 )
-from experiments.laws.page import CELLS, CHECKED, CHECKS, CORNER, LAWS, PYRAMIDAL, RIGID, ZEROTH, measured, tables
+from experiments.laws.page import (
+    CELLS,
+    CHECKED,
+    CHECKS,
+    CORNER,
+    LAWS,
+    PYRAMIDAL,
+    RIGID,
+    TOSSES,
+    ZEROTH,
+    measured,
+    tables,
+)
 from experiments.pages import write_tables
 from mjx_study.runtime import configure
 from mjx_study.simulation.law import LAWS as OTHERS
@@ -59,6 +72,7 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
         found[f"throw, kappa {scale:g}", row] = partial(integrated, "throw", row, "none", scale)
     for scene, (row, each) in itertools.product(MORE, LAWS.items()):
         found[scene, row] = partial(sampled if scene in SAMPLED else integrated, scene, *each)
+    found |= {(scene, row): partial(integrated, scene, *LAWS[row]) for scene, row in TOSSES}
     for row, scale in itertools.product(("kelvin_voigt", "conic"), (0.1, 10.0)):
         found[f"throw, kappa {scale:g}", row] = partial(integrated, "throw", row, "none", scale)
     for row in (*LAWS, RIGID):
@@ -67,7 +81,8 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
     found |= {("corner", row): partial(corner, **changes) for row, changes in CORNER.items()}
     for name, law, cone in itertools.product(CHECKED, OTHERS, ("", "pyramidal")):
         if not cone or (name, law) in PYRAMIDAL:
-            found[f"gradcheck {name}{' ' * bool(cone)}{cone}", law] = partial(checked, name, law, cone)
+            for kind, compute in (("gradcheck", checked), ("compare", compared)):
+                found[f"{kind} {name}{' ' * bool(cone)}{cone}", law] = partial(compute, name, law, cone)
     return found
 
 
@@ -95,7 +110,7 @@ def run(asked: dict[tuple[str, str], Callable[[], dict[str, Any]]], into: Path |
             name: float(each) if np.ndim(each) == 0 and not isinstance(each, str | None) else each
             for name, each in numbers.items()
         }
-        with (into or (CHECKS if scene.startswith(("gradcheck", "corner")) else CELLS)).open("a") as file:
+        with (into or (CHECKS if scene.startswith(("gradcheck", "compare", "corner")) else CELLS)).open("a") as file:
             file.write(json.dumps({"scene": scene, "row": row, **numbers}) + "\n")
         print(f"{scene}, {row}: {time.perf_counter() - begin:.0f} s", flush=True)
 

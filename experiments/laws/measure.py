@@ -19,12 +19,13 @@ import mjx_study as study
 from estimators import NOISES, first_order, zeroth_order
 from experiments.laws.page import RIGID
 from experiments.laws.scenes import SCENES, SPEED, throw
-from mjx_study.choices import DEFAULT_SOLREF, FAMILIES
+from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.gradcheck import gradcheck, plan_gradcheck
 from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
+from mjx_study.results.rows import rows_of
 from mjx_study.simulation.contact import (
     ContactModel,
     apply_contact,
@@ -34,6 +35,7 @@ from mjx_study.simulation.contact import (
 )
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.engine import engine_model
+from mjx_study.simulation.law import make_law
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
@@ -52,6 +54,8 @@ TRAINED: Final = {
     "ball_wall": {"iterations": 40, "samples": (30,), "learning_rate": 1.0},
 }
 SEEDS, DRAWS = 3, 1000
+BATCH: Final = 1000
+"""Samples, and pairs of rollouts of the reference, of `compared`."""
 DURATION, NARROW = 0.8, 1e-6  # [s], [rad]
 
 
@@ -66,6 +70,13 @@ def member(task: Task, family: str, scale: float = 1.0) -> ContactModel:
     return family_model(family, task.scene, smoothing=of.smoothing * scale or None, **given)
 
 
+def unmapped(family: str) -> ContactModel:
+    """Return a law of MuJoDiCo with MuJoCo's default solref as it stands, which the package reads in its own way, or
+    MuJoCo's default."""
+    law = make_law(family, FAMILIES[family].smoothing) if FAMILIES[family].smoothing else None
+    return ContactModel(jnp.array(DEFAULT_SOLREF), jnp.array(DEFAULT_SOLIMP), law=law)
+
+
 @cache
 def line(scene: str, onset: str) -> tuple[Task, Line]:
     """A scene's task, and its cost and derivative, compiled once for all contacts of a law."""
@@ -76,7 +87,8 @@ def line(scene: str, onset: str) -> tuple[Task, Line]:
 def integrated(scene: str, family: str, onset: str, scale: float = 1.0) -> dict[str, Any]:
     """Slope of the mean cost, mean of the derivative, their errors, deviations of one sample, and time."""
     task, costs = line(scene, onset)
-    contact, position = member(task, family, scale), np.asarray(task.theta, float)
+    contact = unmapped(family) if scene.startswith("toss") else member(task, family, scale)
+    position = np.asarray(task.theta, float)
     count = POINTS if task.scene.host.nv < MANY_JOINTS else POINTS // 4
     points = grid(position[0], position[0], task.sigma, count, task.noise)
     values, slopes = costs(points, contact)
@@ -271,6 +283,32 @@ def checked(name: str, family: str, cone: str) -> dict[str, Any]:
         "of_step": of_step.differences,
         "of_parameters": of_step.parameters,
         "exercised": of_step.coverage.line(),
+    }
+
+
+def compared(name: str, family: str, cone: str) -> dict[str, Any]:
+    """What `compare` says of first order's mean under a law, at the task's middle stiffness."""
+    stiffnesses = make_task(name).defaults.stiffnesses
+    given: dict[str, Any] = {"cone": (cone,)} if cone else {}
+    if FAMILIES[family].swept:
+        given["stiffness"] = (float(stiffnesses[len(stiffnesses) // 2]),)
+    about = StudyConfig(
+        tasks=(name,),
+        contact=(family,),
+        estimators=("zobg", "fobg"),
+        samples=(BATCH,),
+        reference_samples=BATCH,
+        **given,
+    )
+    zeroth, first = rows_of(run_study(about))
+    return {
+        "verdict": first.bias_verdict,
+        "p": first.bias_p_value,
+        "error": first.relative_error,
+        "uncertainty": first.reference_uncertainty,
+        "variances": first.variance / zeroth.variance,
+        "residual": first.residual,
+        "bad": first.unconverged + first.nonfinite + zeroth.nonfinite,
     }
 
 

@@ -24,6 +24,12 @@ LAWS: Final = {
 MEANS: Final = ("throw", "ball_wall", "skid", "corners", "box", "pusher", "tennis", "landing")
 BODIES: Final = ("roll", "stack", "stacked_corners", "quadruped standing", "quadruped landing")
 KAPPAS: Final = ("throw, kappa 0.1", "throw", "throw, kappa 10")
+TOSSES: Final = tuple(
+    (f"toss {step} ms", row)
+    for row in ("MuJoCo's default", "with the onset term", *OTHERS)
+    for step in (("5", "2", "0.5") if row not in OTHERS else ("5", "2"))
+)
+"""Scene and row of the lines of the table `toss`."""
 RIGID: Final = "rigid"
 """In place of a law: the C engine's limit of stiff contact and short steps."""
 ZEROTH: Final = "MuJoCo's default, zeroth order"
@@ -34,9 +40,11 @@ CORNER: Final[dict[str, dict[str, float]]] = {
     **{f"kappa x {each:g}": {"scale": each} for each in (0.1, 10.0)},
 }
 """Changes of `ball_wall` and of Kelvin-Voigt on it."""
-PYRAMIDAL: Final = {*itertools.product(("sliding_box", "ball_wall", "gripper", "landing"), ("log_barrier", "conic"))}
+PYRAMIDAL: Final = {
+    *itertools.product(("sliding_box", "ball_wall", "ball_wall:dome", "gripper", "landing"), ("log_barrier", "conic"))
+}
 """Tasks and laws that need pyramidal cones."""
-CHECKED: Final = tuple(name for name in TASK_DESCRIPTIONS if not name.endswith((":dome", ":published")))
+CHECKED: Final = tuple(name for name in TASK_DESCRIPTIONS if not name.endswith(":published"))
 
 
 def measured(*others: Path) -> dict[tuple[str, str], dict[str, Any]]:
@@ -88,6 +96,12 @@ def tables() -> dict[str, str]:
         "lands down to [mm]": lambda of: f"{1e3 * of['lowest']:.1f}",
         "and goes [mm]": lambda of: f"{1e3 * of['way']:.0f}",
     }
+    tossed: dict[str, Callable[[dict[str, Any]], str]] = {
+        "slope": lambda of: f"{of['slope']:.4f}",
+        "E[FoBG]": lambda of: f"{of['first']:.4f}",
+        "deviation": lambda of: f"{of['first_sd']:.2g}",
+    }
+    tosses = [[row, scene.split()[1], *(cell(scene, row, say) for say in tossed.values())] for scene, row in TOSSES]
     usual = found["throw", "MuJoCo's default"]["seconds"]
     first: dict[tuple[str, str], Callable[[dict[str, Any]], str]] = {
         ("throw", "a ball lands"): bias,
@@ -120,12 +134,28 @@ def tables() -> dict[str, str]:
         kinds = {kind: f", {kind}s" for kind in ("kink", "jump") if kind in of["verdicts"]}
         return "wrong" if of["failing"] else f"right{''.join(kinds.values())} ({max(errors):.0e})"
 
-    def of_task(name: str, law: str) -> str:
-        turned = f"gradcheck {name} pyramidal"
-        marked = lambda of: f"{verdict(of)} *"  # noqa: E731
-        return cell(turned, law, marked) if (name, law) in PYRAMIDAL else cell(f"gradcheck {name}", law, verdict)
+    def off(of: dict[str, Any]) -> str:
+        said = {"biased": "biased, ", "none seen": ""}.get(of["verdict"], "? ")
+        error, uncertainty = (f"{float(f'{100 * of[name]:.2g}'):g}" for name in ("error", "uncertainty"))
+        return f"{said}{error} ({uncertainty}) %"
 
-    checks = [[f"`{name}`", *(of_task(name, law) for law in OTHERS)] for name in CHECKED]
+    def of_tasks(kind: str, say: Callable[[dict[str, Any]], str]) -> list[list[str]]:
+        def of_task(name: str, law: str) -> str:
+            marked = lambda of: f"{say(of)} *"  # noqa: E731
+            turned = (name, law) in PYRAMIDAL
+            return cell(f"{kind} {name}{' pyramidal' * turned}", law, marked if turned else say)
+
+        return [[f"`{name}`", *(of_task(name, law) for law in OTHERS)] for name in CHECKED]
+
+    # One row for each reason: by the laws that give it and the tasks of which they do
+    lacking: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
+    for (scene, law), numbers in found.items():
+        kind, _, name = scene.removesuffix(" pyramidal").partition(" ")
+        if "refused" in numbers and kind in ("gradcheck", "compare"):
+            reason = numbers["refused"].removeprefix(f"{law} does not support ").removeprefix(f"{name} ")
+            laws, tasks = lacking.setdefault(reason, ({}, {}))
+            laws[law], tasks[f"`{name}`"] = None, None
+    refusals = [[", ".join(tasks), ", ".join(laws), reason] for reason, (laws, tasks) in lacking.items()]
     shares: dict[str, Callable[[dict[str, Any]], str]] = {
         "share of the slope": lambda of: f"{100 * of['share']:.1f} %",
         "of it in 1e-6 rad": lambda of: f"{100 * of['narrow']:.2g} %",
@@ -136,11 +166,17 @@ def tables() -> dict[str, str]:
         "summary": (("law", *(name for _, name in first)), summary),
         "means": (("law", *MEANS, "ms per gradient"), means),
         "motion": (("law", *stands), motion),
+        "toss": (("law", "step [ms]", *tossed), tosses),
         "bodies": (("law", *BODIES), more),
         "deviations": (("law", *MEANS), spreads),
         "fidelity": (("law", *says), fidelity),
         "descents": (("law", *ways), descents),
         "smoothing": (("law", "kappa / 10", "kappa", "10 kappa"), kappas),
     }
-    rows |= {"gradcheck": (("task", *OTHERS), checks), "corner": (("`ball_wall`", *shares), corners)}
+    rows |= {
+        "gradcheck": (("task", *OTHERS), of_tasks("gradcheck", verdict)),
+        "compare": (("task", *OTHERS), of_tasks("compare", off)),
+        "refusals": (("tasks", "laws", "what is lacking"), refusals),
+        "corner": (("`ball_wall`", *shares), corners),
+    }
     return {name: markdown_table(lines, header) for name, (header, lines) in rows.items()}

@@ -16,7 +16,9 @@ from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
-TIMESTEP, GAP, SPREAD = 0.005, 0.05, 0.005  # [s], [m], [m]
+TIMESTEP, GAP, SPREAD, WIDE = 0.005, 0.05, 0.005, 0.05  # [s], [m], [m], [m]
+TOSSED: Final = (0.005, 0.002, 0.0005)
+"""Timesteps of `toss` [s]."""
 SPEED, RADIUS, MASS = 1.0, 0.1, 1.0  # [m/s], [m], [kg]
 CROUCH: Final = 0.05
 """Noise of a standing robot's posture [rad]."""
@@ -54,6 +56,18 @@ def skid(geom: str = "ball") -> Task:
     start = lambda rest, speed: State(rest.qpos, rest.qvel.at[0].set(speed[0]), rest.act, rest.warmstart)  # noqa: E731
     name = "roll" if geom == "rolling" else "skid"
     return thrown(name, geom, 60, start, SPEED, 0.1 * SPEED, lambda last: last.qpos[0])
+
+
+def toss(timestep: float) -> Task:
+    """A ball that can turn falls through 0.25 m, with noise of 5 cm, at 1 m/s down and along, for 0.4 s; heights in the
+    cost, whose target is 0.1 m, are those above 0.3 m, where the body is in the model."""
+
+    def start(rest: State, height: jax.Array) -> State:
+        return State(rest.qpos.at[1].set(height[0]), jnp.array([SPEED, -SPEED, 0.0]), rest.act, rest.warmstart)
+
+    cost = lambda last: 100 * (last.qpos[1] - 0.1) ** 2 + last.qpos[0] + last.qpos[1]  # noqa: E731
+    mjcf = PLANE.format(timestep, THROWN.format(3 * RADIUS, GEOMS["rolling"]))
+    return task_of_start("toss", mjcf, round(0.4 / timestep), start, GAP, WIDE, cost, ("thrown", "floor"))
 
 
 def stack(name: str = "stack") -> Task:
@@ -120,6 +134,7 @@ SCENES: Final[dict[str, Callable[[], Task]]] = {
         "box": box,
         "corners": partial(box, "corners", GEOMS["corners"]),
     },
+    **{f"toss {1e3 * each:g} ms": partial(toss, each) for each in TOSSED},
     **{
         "stack": stack,
         "stacked_corners": partial(stack, "stacked_corners"),
