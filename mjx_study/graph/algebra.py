@@ -70,13 +70,31 @@ def _sort(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arr
     size = len(arrays[0])
     for row in np.ndindex(*arrays[0].shape[1:]):
         for at in (at for end in range(size - 1, 0, -1) for at in range(end)):
-            here, after = (at, *row), (at + 1, *row)
-            swap = _precedes(graph, [each[after] for each in arrays[:keys]], [each[here] for each in arrays[:keys]])
-            for each in arrays:
-                low, high = each[here], each[after]
-                each[here] = graph.scalar(lax.select_n_p, (swap, low, high), low.dtype)
-                each[after] = graph.scalar(lax.select_n_p, (swap, high, low), low.dtype)
+            _exchange(graph, arrays, (at + 1, *row), (at, *row), keys)
     return [np.moveaxis(each, 0, axis) for each in arrays]
+
+
+@no_type_check
+def _top_k(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
+    """The k largest entries, each brought forward from the end, and their indices; the first of equal ones first."""
+    axis, k = parameters["axis"], parameters["k"]
+    entries = np.moveaxis(inputs[0], axis, 0).copy()
+    indices = constants(np.broadcast_to(np.arange(len(entries), dtype=np.int32), entries.T.shape).T.copy())
+    for row in np.ndindex(*entries.shape[1:]):
+        for at in (at for place in range(k) for at in range(len(entries) - 2, place - 1, -1)):
+            _exchange(graph, [entries, indices], (at + 1, *row), (at, *row), reverse=True)
+    return [np.moveaxis(each[:k], 0, axis) for each in (entries, indices)]
+
+
+@no_type_check
+def _exchange(graph, arrays, after, here, keys: int = 1, reverse: bool = False) -> None:
+    """Exchange two entries of arrays if the keys, the first arrays, of the second come before those of the first."""
+    ordered = [[each[at] for each in arrays[:keys]] for at in (after, here)]
+    swap = _precedes(graph, *(reversed(ordered) if reverse else ordered))
+    for each in arrays:
+        low, high = each[here], each[after]
+        each[here] = graph.scalar(lax.select_n_p, (swap, low, high), low.dtype)
+        each[after] = graph.scalar(lax.select_n_p, (swap, high, low), low.dtype)
 
 
 @no_type_check
@@ -95,4 +113,4 @@ def _precedes(graph: ScalarGraph, one: Sequence[Any], other: Sequence[Any]) -> A
     return logic.of(lax.or_p, before, later)
 
 
-ALGEBRA: Final = {"cholesky": _cholesky, "sort": _sort, "triangular_solve": _triangular_solve}
+ALGEBRA: Final = {"cholesky": _cholesky, "sort": _sort, "top_k": _top_k, "triangular_solve": _triangular_solve}
