@@ -29,9 +29,10 @@ def option(
         line: One line for the help, in which {} stands for the choices.
         interval: Range of its numbers, such as "(0, inf)".
         choices: Accepted names, in addition to numbers if there is an interval.
-        default: Without one, the option is required.
+        default: Value unless another is given; without one, the option is required.
         example: Value in examples, for a required option.
         metavar: Placeholder for a value in the help.
+        unit: Unit of its numbers.
     """
     described = {"line": line, "interval": interval, "choices": choices, "metavar": metavar, "unit": unit}
     return dataclasses.field(default=default, metadata=described | {"example": example})

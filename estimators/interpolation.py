@@ -137,6 +137,8 @@ def alpha_order(
     the mean at order 1/N (`weigh_batches` avoids this). The variance and standard errors treat the weight as fixed.
 
     Args:
+        zeroth: Zeroth-order estimate, assumed unbiased.
+        first: First-order estimate from the same number of independent samples.
         gamma: Largest acceptable error, [cost/param]; infinity for inverse-variance weighting.
         epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`.
 

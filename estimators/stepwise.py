@@ -133,9 +133,12 @@ def discontinuity_gated(
     radius to choose, and no guarantee if the test is wrong.
 
     Args:
+        evaluation: For f and the zeroth-order estimate.
+        differentiation: Batch of the same number of independent samples.
+        baseline: A name in `BASELINES`, for the zeroth-order estimate.
         sigma: Standard deviation of the Gaussian noise, [control].
         tolerance: c in [0, 1); 0.3 as published.
-        weights: If cross-fitted, the test also uses the other half.
+        weights: A name in `WEIGHTS`; if cross-fitted, the test also uses the other half.
 
     Raises:
         ValueError: The tolerance is outside [0, 1), or the batches differ in shape.

@@ -99,6 +99,7 @@ def delta_control_variate(
     own gradient. A wrong g only costs variance, so references use this even where first-order gradients are biased.
 
     Args:
+        evaluation: Open-loop batch.
         gradient: g, such as a first-order mean from other samples, [cost/param].
         sigma: Standard deviation of the noise, [param].
     """

@@ -203,10 +203,7 @@ def test_a_learning_rate_lowers_the_cost() -> None:
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (
-            '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>',
-            "has no degree of freedom: there is nothing to study",
-        ),
+        ('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>', "has no degree of freedom"),
         (PENDULUM.replace('damping=".01"', 'armature="1e12"'), "noise on its controls of .* moves not"),
         (PENDULUM.replace('damping=".01"', 'stiffness="1e300" springref="90"'), "state is not finite after step"),
         ("<mujoco>", "is not a valid MJCF"),

@@ -268,20 +268,13 @@ def test_no_such_module(write) -> None:
         ("hop = 3", "mine:hop is neither a Task nor a function that returns one, but of type int"),
         ("def hop(): ...", "mine:hop returned an object of type NoneType instead of a Task"),
         ("def hop():\n  return 1 / 0", "mine:hop raised ZeroDivisionError: division by zero (mine.py, line 2)"),
-        (
-            "def hop(kind): ...",
-            "mine:hop does not take the options given (missing a required argument: 'kind'): give it an argument for "
-            "each, and others a default",
-        ),
-        (
-            "from mjx_study import load_scene\ndef hop(): load_scene('nothing.xml')",
-            "mine:hop raised SceneError: no MJCF file at nothing.xml (mine.py, line 2)",
-        ),
+        ("def hop(kind): ...", "mine:hop does not take the options given (missing a required argument: 'kind')"),
+        ("import mjx_study as m\ndef hop(): m.load_scene('a.xml')", "mine:hop raised SceneError: no MJCF file at a."),
     ],
 )
 def test_what_is_no_task(source: str, says: str, write) -> None:
     write(source)
-    assert refused("mine:hop") == says
+    assert refused("mine:hop").startswith(says)
 
 
 def test_options_that_a_function_does_not_take(write) -> None:
@@ -292,44 +285,27 @@ def test_options_that_a_function_does_not_take(write) -> None:
 
 def test_a_task_takes_no_options(write) -> None:
     write(TINY + "\nmade = hop()\n")
-    assert refused("mine:made", horizon=3, cone="elliptic") == (
-        "mine:made is a ready-made Task, which horizon and cone cannot change: "
-        "give a function that takes this and returns the Task"
-    )
+    message = refused("mine:made", horizon=3, cone="elliptic")
+    assert message.startswith("mine:made is a ready-made Task, which horizon and cone cannot change")
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (
-            "policy=OpenLoop(1, 3)",
-            "mine:bad: the policy's feedforward has shape (1, 3); 3 steps and 1 controls need (3, 1)",
-        ),
-        ("theta=jnp.zeros(3, jnp.float32)", "mine:bad: theta is float32, and the simulation float64"),
-        ("final_cost=lambda state: state.qpos", "mine:bad: the final_cost has shape (2,), and a cost is a scalar"),
-        (
-            "running_cost=lambda state, control: control",
-            "mine:bad: the running_cost has shape (1,), and a cost is a scalar",
-        ),
-        (
-            "final_cost=lambda state: state.position[0]",
-            "mine:bad: the final_cost raised AttributeError: a state has qpos, qvel, act, ",
-        ),
-        (
-            "policy=InitialStatePolicy(3, 0, 3, lambda start, theta: 1 / 0)",
-            "mine:bad: the policy's place raised ZeroDivisionError: division by zero (mine.py, ",
-        ),
-        (
-            "start=State(jnp.zeros(1), jnp.zeros(2), jnp.zeros(0), jnp.zeros(2))",
-            "mine:bad: qpos of the start has shape (1,); the scene needs (2,)",
-        ),
-        ("sigma=0.0", "mine:bad raised ValueError: sigma must be positive"),
+        ("policy=OpenLoop(1, 3)", "the policy's feedforward has shape (1, 3); 3 steps and 1 controls need (3, 1)"),
+        ("theta=jnp.zeros(3, jnp.float32)", "theta is float32, and the simulation float64"),
+        ("final_cost=lambda state: state.qpos", "the final_cost has shape (2,), and a cost is a scalar"),
+        ("running_cost=lambda state, control: control", "the running_cost has shape (1,), and a cost is a scalar"),
+        ("final_cost=lambda state: state.position[0]", "the final_cost raised AttributeError: a state has qpos, qvel"),
+        ("policy=InitialStatePolicy(3, 0, 3, lambda start, theta: 1 / 0)", "place raised ZeroDivisionError: division"),
+        ("start=State(*map(jnp.zeros, (1, 2, 0, 2)))", "qpos of the start has shape (1,); the scene needs (2,)"),
+        ("sigma=0.0", "ValueError: sigma must be positive"),
     ],
 )
 def test_parts_that_do_not_fit(change: str, says: str, write) -> None:
     """Broadcasting and clamped indices would let most of these pass, and give numbers."""
     write(TINY + f"\ndef bad():\n    return hop().replace({change})\n")
-    assert refused("mine:bad").startswith(says)
+    assert says in refused("mine:bad")
 
 
 # What a task may leave out

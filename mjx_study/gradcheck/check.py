@@ -113,8 +113,14 @@ def plan_scene_gradcheck(
     Args:
         scene: the scene, in float64, with at least one degree of freedom.
         families: contact families; by default `mjcf`, or `mujoco` if a stiffness is given.
+        stiffnesses: stiffnesses for families that take one [N/m].
+        seed: random seed of the states.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
+        damping: override of each family's damping [N s/m].
+        smoothing: override of the smoothing kappa of laws other than MuJoCo's [J].
         horizon: number of steps of the rollout from which states are taken.
+        states: number of states per contact model.
+        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as for `plan_gradcheck`, or a stiffness without a pair.

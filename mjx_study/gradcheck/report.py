@@ -55,13 +55,15 @@ class Entry:
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Entries that are not right, with a common cause; the text quotes the first as example.
+    """Entries that are not right, with a common cause.
 
     Attributes:
         contact: label of the contact model, such as penalty, K = 100 N/m.
         who: owner of the derivative: `project` or `mjx.step`.
         verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
         modes: differentiation modes that show it: forward, reverse, tape.
+        cause: likely cause, in one sentence.
+        entries: all affected entries, at any state; the text quotes the first as example.
     """
 
     contact: str
@@ -134,8 +136,10 @@ class StepCheck:
     """Checks of single steps for one contact model; errors are relative, the worst over the states.
 
     Attributes:
+        contact: name of the contact family.
         stiffness: K [N/m]; 0 if the contact model is not defined by one.
-        states, entries: number of states checked, and total number of Jacobian entries.
+        states: number of states checked.
+        entries: total number of Jacobian entries.
         unresolved: number of entries whose differences are too uncertain to judge.
         modes: difference between reverse and forward mode.
         differences: error of derivatives with respect to state and control, by central differences.
@@ -146,6 +150,7 @@ class StepCheck:
         engine: difference of the Jacobian from the C engine's where the steps agree; None if they never do.
         stock: error of the derivative of `mjx.step`; None if not requested, infinite if NaN.
         residual: largest relative solver residual.
+        coverage: parts of the model that the states exercise.
         verdict: worst of the findings on the project's derivative.
     """
 
@@ -175,10 +180,13 @@ class GradcheckReport:
     """All checks and findings, with the environment.
 
     Attributes:
+        subject: name of the task or file.
+        summary: size of the model, and what was checked, in one line.
         costs: checks of whole-horizon gradients, one per contact model; empty for a file.
         steps: checks of single steps, one per contact model.
-        findings: worst first.
-        warnings: about contact models and about features without a derivative.
+        findings: findings, worst first.
+        warnings: warnings about contact models and about features without a derivative.
+        environment: versions, machine, devices and precision.
     """
 
     subject: str

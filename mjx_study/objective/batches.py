@@ -36,6 +36,7 @@ class Simulator:
     """The compiled programs of a task.
 
     Attributes:
+        task: the task to simulate; each call replaces its scene's contact parameters.
         chunk_size: samples per device and call; see `chunk_for`.
         devices: devices to spread samples over; by default those of `mjx_study.runtime.local_devices`.
     """
@@ -116,7 +117,8 @@ class MjxObjective:
     """F(theta) = E V_1 of a task with a contact model; implements `estimators.Objective`.
 
     Attributes:
-        contact: None for the MJCF's own.
+        simulator: the compiled programs, shared by all contact models of a sweep.
+        contact: the contact model; None for the MJCF's own.
         sigma: standard deviation of the noise, in the unit of the quantity it is added to.
     """
 

@@ -93,7 +93,9 @@ def simulate(
     """Roll out one sample: states including the initial one, controls, cost and largest solver residual.
 
     Args:
-        contact: None for the MJCF's own.
+        task: the task, with the noise's density and standard deviation.
+        theta: policy parameters, (params,).
+        contact: the contact model; None for the MJCF's own.
         key: key of the sample; draws the initial state and noise as in a batch.
         noise_scale: factor of the noise; 0 for a zero-noise rollout.
     """

@@ -138,9 +138,12 @@ class InitialStatePolicy:
 
     Attributes:
         num_params: length of theta and of the noise w.
-        horizon, controls: numbers of steps H and of controls m, all zero.
+        horizon: number of steps H.
+        controls: number of controls m, all zero.
         start_at: maps (start, theta + w) to the initial state of the simulation.
         unit: unit of theta; empty if unknown.
+        additive: True, since the noise is added to theta entry by entry.
+        at_start: True, since theta and the noise act on the initial state only.
     """
 
     num_params: int
