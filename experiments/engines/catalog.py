@@ -116,9 +116,7 @@ ENGINES: Final = {
         )
         for name, how in (("plain", "torch's tape"), ("soft", "torch's tape, differentiable_mode"))
     },
-    "old_mjx": Engine(
-        "MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode", left="a control, of the toss alone"
-    ),
+    "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode", left="a control; not run"),
 }
 
 
