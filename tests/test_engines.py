@@ -1,5 +1,6 @@
 """Gradients of other engines: the cells that need no other environment, the verdicts, and the page."""
 
+import itertools
 import json
 import math
 import subprocess
@@ -75,8 +76,10 @@ def test_a_scene_that_an_engine_lacks_is_a_dash_with_a_reason() -> None:
 
 
 def test_the_page_says_what_the_data_give() -> None:
-    text = PAGE.read_text()
-    assert replace_tables(text, tables(cells(CELLS), cells(CHECKS))) == text
+    text, found = PAGE.read_text(), cells(CELLS)
+    assert replace_tables(text, tables(found, cells(CHECKS))) == text
+    every = list(itertools.product(catalog.ENGINES, SCENES, TIMESTEPS))
+    assert f"Of {len(every)} cells, {sum(key not in found for key in every)} are [not measured]" in text
 
 
 def test_times_and_versions_are_those_of_the_cells() -> None:
