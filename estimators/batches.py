@@ -69,7 +69,6 @@ class StepEvaluation:
         noise_score: grad psi(w_h^i); w / sigma^2 for Gaussian noise, [1/control].
         policy_jacobian: D_theta pi(x_h^i), [control/param]; None if theta matches the noise entry by entry and acts in
             the same way.
-        residual: As in `Evaluation`.
     """
 
     value_to_go: Float[Array, "samples steps"]
@@ -89,8 +88,6 @@ class StepDifferentiation:
     Attributes:
         value: V_1^i, the total cost, [cost].
         noise_gradient: dV_1^i / dw_h, which is dV_1^i / du_h, [cost/control].
-        policy_jacobian: As in `StepEvaluation`.
-        residual, events: As in `Differentiation`.
     """
 
     value: Float[Array, " samples"]

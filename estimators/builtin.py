@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 class Formula(Estimator):
     """Base of estimators that apply a function to their batches, with their options as keywords."""
 
+    separable = True
+
     computes: ClassVar[str]
     """The function, as module:name."""
 
@@ -41,6 +43,8 @@ class Baselined(Formula):
 @dataclass(frozen=True, kw_only=True)
 class Interpolation(Baselined):
     """Base of estimators that weight two batches."""
+
+    separable = False  # weights may differ between steps
 
     weights: str = option(
         "weights of interpolations: plug_in, or cross_fitted (unbiased)", choices=WEIGHTS, default=PLUG_IN
@@ -62,7 +66,6 @@ class ZerothOrder(Baselined):
     name, label, needs = "zobg", "ZoBG", ("evaluation",)
     formula, unbiased = r"$`(V_1 - b)\, s`$", "always"
     style = "#0072B2", "o"
-    separable = True
 
     computes = "estimators.zeroth_first:zeroth_order"
 
@@ -74,7 +77,6 @@ class Antithetic(Paired):
     name, label, needs = "zobg_antithetic", "ZoBG (antithetic)", ("pair",)
     formula, unbiased = "the mean of `zobg` over the pair $`w, -w`$", "for symmetric noise"
     style = "#56B4E9", "v"
-    separable = True
 
     computes = "estimators.zeroth_first:antithetic"
 
@@ -86,7 +88,6 @@ class CostToGo(Baselined):
     name, label, needs = "zobg_to_go", "ZoBG (costs to go)", ("steps",)
     formula, unbiased = r"$`\sum_h D\pi^\top \nabla\psi(w_h)\, (V_h - b_h)`$", "always"
     style = "#56B4E9", "P"
-    separable = True
 
     computes = "estimators.stepwise:cost_to_go"
 
@@ -98,7 +99,6 @@ class AntitheticCostToGo(Paired):
     name, label, needs = "zobg_to_go_antithetic", "ZoBG (to go, antithetic)", ("step_pair",)
     formula, unbiased = "the mean of `zobg_to_go` over the pair $`w, -w`$", "for symmetric noise"
     style = "#0072B2", "X"
-    separable = True
 
     computes = "estimators.stepwise:antithetic_cost_to_go"
 
@@ -110,7 +110,6 @@ class FirstOrder(Formula):
     name, label, needs = "fobg", "FoBG", ("differentiation",)
     formula, unbiased = r"$`\nabla_\theta V_1`$", "where f is continuous"
     style = "#D55E00", "s"
-    separable = True
 
     computes = "estimators.zeroth_first:first_order"
 
@@ -133,7 +132,6 @@ class ClippedFirstOrder(Formula):
     name, label, needs = "fobg_clipped", "FoBG (clipped)", ("differentiation",)
     formula, unbiased = "`fobg`, each sample clipped to a norm of `--max-norm`", "no"
     style = "#E69F00", "<"
-    separable = True
 
     max_norm: float = option("fobg_clipped: norm at which samples are clipped", "(0, inf)", metavar="G", example=1000.0)
 
@@ -148,7 +146,6 @@ class TruncatedFirstOrder(Formula):
     name, label, needs = "fobg_truncated", "FoBG (truncated)", ("linearisation",)
     formula, unbiased = "`fobg`, the adjoint cut every `--window` steps", "no"
     style = "#E69F00", ">"
-    separable = True
 
     window: int = option("fobg_truncated: steps between cuts", "[1, 1000000]", metavar="H", example=20)
 
@@ -192,13 +189,7 @@ class OneWeight(Interpolation):
 class AlphaOrder(OneWeight):
     """Alpha order: the two interpolated with an error of at most gamma.
 
-    Attributes:
-        baseline: A name in `BASELINES`, for the zeroth-order batch.
-        weights: A name in `WEIGHTS`, the source of alpha.
-        gamma: Largest acceptable error, > 0 or infinity, [cost/param].
-        failure_probability: Failure probability of the confidence radius, in (0, 1); see `bernstein_epsilon`.
-        variance_proxy: "variance", "second_moment" or "upper_bound".
-        radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
+    Gamma and the radius are in [cost/param]; the last three options are those of `bernstein_epsilon`.
     """
 
     name, label, needs = "aobg", "AoBG", ("evaluation", "differentiation")

@@ -35,7 +35,6 @@ class Oracle:
         name: Name in `ORACLES` and in an estimator's `needs`.
         order: 0 if only values are needed, 1 if derivatives are; batches of the same order share their samples.
         method: Method of the objective, called with theta and keys.
-        contents: What the batch holds, for messages and tables.
         rollouts: Number of rollouts of a sample.
         baseline: Whether the batch also has rollouts without noise.
     """

@@ -155,8 +155,7 @@ def bias_test(first: GradientEstimate, zeroth: GradientEstimate, key: Key[Array,
     mean is then unknown.
 
     Args:
-        first: First-order estimate, the one tested for bias; its samples are independent of those of `zeroth`.
-        zeroth: Zeroth-order estimate from independent samples.
+        first: The estimate that is tested for bias; its samples are independent of those of `zeroth`.
         key: Random key for the multipliers; consumed.
         num_draws: Number of draws of T*, >= 1; the smallest possible p-value is 1 / (num_draws + 1).
 

@@ -213,7 +213,6 @@ def variance_upper_bound(
     Pairs with a nonfinite row are left out; without any pair, the bound is 2 R^2.
 
     Args:
-        estimate: The estimate; pairs with a nonfinite row are left out.
         radius: R >= ||g_i - E g|| always, [cost/param].
         failure_probability: In (0, 1).
 

@@ -29,10 +29,9 @@ def option(
         line: One line for the help, in which {} stands for the choices.
         interval: Range of its numbers, such as "(0, inf)".
         choices: Accepted names, in addition to numbers if there is an interval.
-        default: Value unless another is given; without one, the option is required.
+        default: Without one, the option is required.
         example: Value in examples, for a required option.
         metavar: Placeholder for a value in the help.
-        unit: Unit of its numbers.
     """
     described = {"line": line, "interval": interval, "choices": choices, "metavar": metavar, "unit": unit}
     return dataclasses.field(default=default, metadata=described | {"example": example})
@@ -88,14 +87,10 @@ class Estimator(ABC):
         """Combine the required batches, one per argument, into an estimate."""
 
     def __call__(self, batches: Batches) -> "estimators.batches.GradientEstimate":
-        """Compute the estimate from drawn batches.
-
-        Args:
-            batches: Batches by name in `ORACLES`; those of order 0 and of order 1 are independent and of the same size.
-                Batches that are not required are ignored.
+        """Compute the estimate from drawn batches; those of order 0 and of order 1 are independent, of the same size.
 
         Raises:
-            ValueError: A batch is missing, or batches differ in shape.
+            ValueError: A batch is missing, or batches differ in shape. Those that are not required are ignored.
         """
         return self.combine(*self.pick(batches))
 

@@ -25,9 +25,7 @@ def inverse_variance_alpha(
     It is 0 where the variances do not determine it (both zero, both infinite, or either one undefined): a first-order
     batch must earn its weight.
 
-    Args:
-        variance_zeroth: sigmahat_0^2 >= 0, [cost^2/param^2]; one for each weight.
-        variance_first: sigmahat_1^2 >= 0, [cost^2/param^2].
+    The variances are >= 0, [cost^2/param^2], one of each for each weight.
 
     Reference: Suh et al. 2022, lemma on the closed form, gamma = infinity.
     """
@@ -139,8 +137,6 @@ def alpha_order(
     the mean at order 1/N (`weigh_batches` avoids this). The variance and standard errors treat the weight as fixed.
 
     Args:
-        zeroth: Zeroth-order estimate, assumed unbiased.
-        first: First-order estimate from the same number of independent samples.
         gamma: Largest acceptable error, [cost/param]; infinity for inverse-variance weighting.
         epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`.
 
@@ -166,12 +162,6 @@ def weigh_batches(
     variance. Everything that enters the choice comes from the other half, including epsilon and B of an accuracy bound;
     a baseline over other samples uses those of its own half.
 
-    Args:
-        choose: Maps batches to weights.
-        mix: Maps weights and batches to an estimate.
-        batches: Batches whose arrays have the samples as first axis.
-        weights: A name in `WEIGHTS`.
-
     Returns:
         The estimate. If cross-fitted, each row is weighted by the other half's weights, and `variance` is the mean of
         the within-half variances: n times the variance of the mean at given weights, as for one batch. This omits the
@@ -179,7 +169,7 @@ def weigh_batches(
         variance of the mean. `alpha` is the mean of both choices.
 
     Raises:
-        ValueError: No weights have that name, or there are too few samples for two halves.
+        ValueError: No weights in `WEIGHTS` have that name, or there are too few samples for two halves.
 
     Reference: Chernozhukov et al., "Double/debiased machine learning for treatment and structural parameters",
     Econometrics Journal 21, 2018.

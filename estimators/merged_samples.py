@@ -239,7 +239,6 @@ class Merged:
         return Deviations(*map(jnp.asarray, found))
 
     def variance_along(self, direction: Float[Array, " params"]) -> Float[Array, ""]:
-        """Variance of the mean's component along a direction."""
         along, count = np.asarray(direction, float), float(self._moments.count)
         spread = np.einsum("p,pq,q->", along, self.covariance, along)
         return jnp.asarray(spread / (count - 1) / count if count > 1 else np.nan)
@@ -247,7 +246,6 @@ class Merged:
     def perturbed_means(
         self, mean: Float[Array, " params"], key: Key[Array, ""], num_draws: int
     ) -> Float[Array, "draws params"]:
-        """Draws of sum_i e_i (g_i - gbar) / sqrt(n (n - 1)) with independent standard normal e_i."""
         count, gap = float(self._moments.count), self.mean - np.asarray(mean)
         spread, axes = np.linalg.eigh(self.covariance + count * np.multiply.outer(gap, gap))
         scale = np.sqrt(np.maximum(spread, 0.0) / max(count * max(count - 1, 1), 1))
@@ -255,7 +253,6 @@ class Merged:
         return jnp.asarray(np.einsum("dk,pk->dp", normal * scale, axes))
 
     def norm_quantiles(self, probabilities: Sequence[float]) -> Float[Array, " probabilities"]:
-        """Quantiles of ||g_i||, linearly interpolated."""
         moments = self._moments
         largest = np.max(np.linalg.norm(self._weighed(moments.extremes), axis=1), initial=0.0)
         norms = np.sqrt(np.maximum(moments.thinned @ self._product, 0.0))
@@ -265,12 +262,10 @@ class Merged:
         return jnp.asarray(np.where(np.asarray(probabilities) == 1.0, np.maximum(found, largest), found))
 
     def largest_deviation(self, mean: Float[Array, " params"]) -> Float[Array, ""]:
-        """max_i ||g_i - gbar||."""
         apart = self._weighed(self._moments.extremes) - np.asarray(mean)
         return jnp.asarray(np.max(np.linalg.norm(apart, axis=1), initial=0.0))
 
     def second_moment(self) -> Float[Array, ""]:
-        """Mean of ||g_i||^2."""
         return jnp.asarray(self._product @ self._moments.products + np.sum(self.mean**2))
 
     def pair_variance(self) -> tuple[Float[Array, ""], Float[Array, ""]]:

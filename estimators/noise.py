@@ -33,7 +33,6 @@ class NoiseDensity:
 
     Attributes:
         name: Key in `NOISES`, and in `estimators.choices.DENSITIES`.
-        draw: Draws samples z from (key, shape, dtype).
         score: psi'(z).
         density: exp(-psi(z)), in NumPy and float64, for quadrature.
         reach: Upper bound on the |z| exceeded with a given probability.

@@ -29,17 +29,13 @@ def truncated_first_order(linearisation: Linearisation, window: int) -> Gradient
     formed: less variance where products grow, and a bias, since later effects are left out. A window of at least the
     horizon gives the first-order batched gradient.
     """
-    check_window(window)
+    if window < 1:
+        raise ValueError(f"window must be at least 1 step; got {window}")
     horizon = linearisation.cost_state.shape[1]
     keeps = jnp.arange(1, horizon + 1) % window != 0
     keeps = keeps.at[-1].set(True) if horizon else keeps  # the end of the horizon is not a cut
     adjoint, controls, _ = _sweep(linearisation, keeps)
     return summarise(_gradient(linearisation, adjoint, controls))
-
-
-def check_window(window: int) -> None:
-    if window < 1:
-        raise ValueError(f"window must be at least 1 step; got {window}")
 
 
 def total_propagation(linearisation: Linearisation, baseline: str, weights: str = PLUG_IN) -> GradientEstimate:
@@ -53,10 +49,7 @@ def total_propagation(linearisation: Linearisation, baseline: str, weights: str 
     open loop nothing propagates through the policy, and steps are mixed independently. Both estimates come from the
     same rollouts, as published, and so are not independent.
 
-    Args:
-        linearisation: Batch of linearised rollouts, with the derivatives of every step.
-        baseline: A name in `BASELINES`, applied step by step; another is a ValueError.
-        weights: A name in `WEIGHTS`, the source of alpha_h.
+    The baseline is applied step by step; a name that is not in `BASELINES` is a ValueError.
 
     Reference: Parmas, Rasmussen, Peters, Doya, "PIPPS: Flexible model-based policy search robust to the curse of
     chaos", ICML 2018, where noise acts on states; here it acts on controls.

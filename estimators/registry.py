@@ -34,11 +34,7 @@ def find_estimator(name: str | Estimator) -> Estimator | type[Estimator]:
 
 
 def make_estimator(which: str | Estimator, **options: Any) -> Estimator:
-    """Return an estimator with its options set.
-
-    Args:
-        which: As for `find_estimator`; an object is returned as is.
-        **options: Options of this or other estimators. Those it does not have and those that are None are ignored.
+    """Return an estimator, looked up as by `find_estimator`, with those of the options that it has and are not None.
 
     Raises:
         ValueError: There is no such estimator, or a required option is missing or out of range.

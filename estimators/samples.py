@@ -61,11 +61,7 @@ class Deviations:
 @register_pytree
 @dataclass(frozen=True)
 class Rows:
-    """Samples stored as rows.
-
-    Attributes:
-        rows: g_i, [cost/param]. Nonfinite rows are ignored below.
-    """
+    """Samples stored as rows g_i, [cost/param]; nonfinite rows are ignored below."""
 
     rows: Float[Array, "samples params"]
 

@@ -18,8 +18,6 @@ def draw(
     """Draw batches by name in `ORACLES`; those of order 0 and those of order 1 use separate sets of keys.
 
     Args:
-        oracles: Names in `ORACLES`; those of the same order share their samples.
-        objective: Objective to sample.
         theta: Parameters, [param].
         key: Random key; consumed.
         num_samples: Samples per batch, >= 1.
@@ -65,7 +63,6 @@ def estimate(
 
     Args:
         estimator: Estimator object, or the name of one whose options are left at their defaults.
-        objective: F, with the methods that the estimator's oracles call.
         theta: Parameters, [param].
         key: Random key; consumed.
         num_samples: Samples per batch, >= 1.

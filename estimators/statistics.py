@@ -39,11 +39,7 @@ def summarise(per_sample: Float[Array, "samples params"]) -> GradientEstimate:
 def norm_quantiles(estimate: GradientEstimate, probabilities: Sequence[float]) -> Float[Array, " probabilities"]:
     """Quantiles of ||g_i|| over the finite rows, [cost/param]; they reveal heavy tails that a variance hides.
 
-    They are interpolated linearly, and NaN without finite rows.
-
-    Args:
-        estimate: The estimate; without finite rows the quantiles are NaN.
-        probabilities: Each in [0, 1]; else a ValueError.
+    They are interpolated linearly, and NaN without finite rows. A probability outside [0, 1] is a ValueError.
     """
     if not all(0.0 <= probability <= 1.0 for probability in probabilities):
         raise ValueError(f"probabilities must lie in [0, 1]; got {list(probabilities)}; a median is 0.5")

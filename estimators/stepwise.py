@@ -29,9 +29,7 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
 
     Same mean as with total costs, since earlier costs do not depend on a step's noise, and less variance.
 
-    Args:
-        steps: Batch of stepwise evaluations, (samples, steps).
-        baseline: A name in `BASELINES`, applied step by step; another is a ValueError.
+    The baseline is applied step by step; a name that is not in `BASELINES` is a ValueError.
 
     Reference: Suh et al. 2022, appendix on the policy gradient.
     """
@@ -76,14 +74,8 @@ def stepwise_inverse_variance(
     The batches are independent and of the same size, and each is pulled back through its own states. Variance and
     standard errors treat the weights as fixed.
 
-    Args:
-        zeroth: Batch of stepwise evaluations, (samples, steps).
-        first: Batch of differentiations from the same number of independent samples.
-        baseline: A name in `BASELINES`, applied step by step.
-        weights: A name in `WEIGHTS`, the source of alpha_h.
-
     Raises:
-        ValueError: The batches differ in shape, or a name is unknown.
+        ValueError: The batches differ in shape, or `baseline` or `weights` is not in `BASELINES` or `WEIGHTS`.
 
     Reference: Onoda, Parmas, Yaguchi, Matsuo, arXiv 2604.18161, ICLR 2026.
     """
@@ -141,19 +133,17 @@ def discontinuity_gated(
     radius to choose, and no guarantee if the test is wrong.
 
     Args:
-        evaluation: For f and the zeroth-order estimate.
-        differentiation: Batch of the same number of independent samples.
-        baseline: A name in `BASELINES`, for the zeroth-order estimate.
         sigma: Standard deviation of the Gaussian noise, [control].
         tolerance: c in [0, 1); 0.3 as published.
-        weights: A name in `WEIGHTS`; if cross-fitted, the test also uses the other half.
+        weights: If cross-fitted, the test also uses the other half.
 
     Raises:
         ValueError: The tolerance is outside [0, 1), or the batches differ in shape.
 
     Reference: Onoda, Parmas, Yaguchi, Matsuo, arXiv 2604.18161, ICLR 2026.
     """
-    check_tolerance(tolerance)
+    if not 0.0 <= tolerance < 1.0:
+        raise ValueError(f"tolerance must lie in [0, 1); got {tolerance}")
 
     def parts(evaluation: Evaluation, differentiation: StepDifferentiation) -> tuple[GradientEstimate, ...]:
         first = summarise(pull_back(_noise_gradients(differentiation), differentiation.policy_jacobian))
@@ -173,11 +163,6 @@ def discontinuity_gated(
         return apply_choice(choice, *parts(evaluation, differentiation))
 
     return weigh_batches(choose, mix, (evaluation, differentiation), weights)
-
-
-def check_tolerance(tolerance: float) -> None:
-    if not 0.0 <= tolerance < 1.0:
-        raise ValueError(f"tolerance must lie in [0, 1); got {tolerance}")
 
 
 def _noise_gradients(differentiation: StepDifferentiation) -> Controls:

@@ -62,9 +62,7 @@ def zeroth_order(evaluation: Evaluation, baseline: str) -> GradientEstimate:
     Unbiased for every f of polynomial growth, continuous or not. Its variance is at most B_V^2 B_pi^2 H m /
     (N sigma^2) for |f - b| <= B_V, ||D pi|| <= B_pi and m noise dimensions at each of H steps.
 
-    Args:
-        evaluation: Batch of evaluations: values, scores and zero-noise costs.
-        baseline: A name in `BASELINES`; another is a ValueError.
+    A baseline that is not in `BASELINES` is a ValueError.
 
     Reference: Suh et al. 2022, def. of the ZoBG and lemma on its variance (which prints H n for the noise
     dimensions).
@@ -82,10 +80,7 @@ def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEs
     opposite, any baseline shared by a pair cancels, and the part of f that is odd in the noise remains,
     ((f^+ - f^-) / 2) s^+: all of the signal without the variance of the even part.
 
-    Args:
-        plus: Batch of evaluations, one of each pair.
-        minus: Batch with the starts of `plus` and the opposite noise.
-        baseline: A name in `BASELINES`, applied within each half; another is a ValueError.
+    `minus` has the starts of `plus` and the opposite noise; the baseline is applied within each half.
     """
     above, below = (zeroth_order(batch, baseline).per_sample for batch in (plus, minus))
     return summarise((above + below) / 2.0)
@@ -104,7 +99,6 @@ def delta_control_variate(
     own gradient. A wrong g only costs variance, so references use this even where first-order gradients are biased.
 
     Args:
-        evaluation: Open-loop batch.
         gradient: g, such as a first-order mean from other samples, [cost/param].
         sigma: Standard deviation of the noise, [param].
     """

@@ -16,8 +16,9 @@ from jax import Array
 import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from experiments import DOCS
+from experiments.linear_quadratic import LinearQuadratic
 from experiments.pages import write_tables
-from mjx_study.reference import LinearQuadratic, ReferenceObjective
+from mjx_study.reference import ReferenceObjective
 from mjx_study.results.curves import DETECTED_SE
 from mjx_study.runtime import configure
 from mjx_study.table import markdown_table, percent

@@ -36,7 +36,7 @@ from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED
-from mjx_study.tasks.contact_grid import ContactPoint, family_grid, single_contact
+from mjx_study.tasks.contact_grid import family_grid, single_contact
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
@@ -89,7 +89,6 @@ class BenchReport:
 
     @property
     def ratios(self) -> dict[str, float]:
-        """The ratios of `RATIOS` that apply."""
         seconds = self.seconds
         return {name: seconds[one] / seconds[other] for name, (one, other) in RATIOS.items() if one in seconds}
 
@@ -131,29 +130,18 @@ class BenchReport:
         ]
 
 
-@dataclasses.dataclass(frozen=True)
-class BenchPlan:
-    task: Task
-    samples: int
-    cell: ContactPoint
-    onset: ContactPoint | None
-    """MuJoCo's default contact, whose force jumps at the onset; None without contact."""
-
-
-def plan_bench(task: Task, samples: int) -> BenchPlan:
-    """Plan a benchmark; ValueError for fewer than one sample."""
+def check_bench(task: Task, samples: int) -> None:
+    """Raise ValueError for fewer than one sample, more than fit into memory, or a task that cannot be simulated."""
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     check_soundness(task)
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
+    single_contact(task)
+
+
+def run_bench(task: Task, samples: int, progress: Progress = silent) -> BenchReport:
+    """Measure everything, interleaved with the baselines, in the contact of a single run; report medians of repeats."""
     cell, _ = single_contact(task)
-    (onset,), _ = family_grid(task, ["mujoco_default"]) if task.contact_pair else ((None,), ())
-    return BenchPlan(task, samples, cell, onset)
-
-
-def run_bench(plan: BenchPlan, progress: Progress = silent) -> BenchReport:
-    """Measure everything, interleaved with the baselines; report medians of repeats."""
-    task, samples, cell = plan.task, plan.samples, plan.cell
     devices = local_devices()
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1], [task]))
@@ -177,8 +165,9 @@ def run_bench(plan: BenchPlan, progress: Progress = silent) -> BenchReport:
             "stock_gradient": (count, stock_gradient),
             "engine_value": engine_rollouts(task, cell.contact, keys[: STOCK_BATCH["cpu"]], len(devices)),
         }
-    if plan.onset is not None:
-        default = simulator.objective(plan.onset.contact)
+    if task.contact_pair is not None:  # MuJoCo's default contact, whose force jumps at the onset
+        (jumping,), _ = family_grid(task, ["mujoco_default"])
+        default = simulator.objective(jumping.contact)
         contenders["onset_base"] = samples, lambda: default.differentiate(task.theta, keys)
         contenders["onset"] = samples, lambda: default.differentiate_corrected(task.theta, keys)
     total = 2 * len(contenders)

@@ -4,14 +4,15 @@ JAX caches what XLA compiles; the trace before it is cached here as StableHLO, k
 depends on (`identity.trace_contents`). User-defined code may read more while it is traced: its files and environment
 variables are kept with the trace, which is made again once one of them differs.
 
-A file holds the structure of the outputs and these inputs as JSON in a line, and the serialised StableHLO; see `caches`
-for who may read and write it.
+A file holds the structure of the outputs and these inputs, pickled, and the serialised StableHLO. Only this user can
+read and write it, like the compiled programs and libraries beside it (`caches`).
 """
 
 import dataclasses
 import hashlib
-import json
+import io
 import os
+import pickle
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -32,7 +33,6 @@ from mjx_study.graph.scans import AS_THEY_ARE
 from mjx_study.identity import TraceContents, trace_contents
 from mjx_study.runtime import available_cores, precision, traces_folder
 from mjx_study.simulation.scene import Scene
-from mjx_study.structure import describe, restore
 from mjx_study.tasks.task import Task
 from mjx_study.watchdog import awaited
 
@@ -216,30 +216,30 @@ class Compiled:
             program = jax.export.export(jitted, disabled_checks=_CallingAny())(*types)
             called = libraries_in(program.mlir_module_serialized)
             trace = dataclasses.replace(program, disabled_safety_checks=_calling(called)).serialize()
-            described = json.dumps({"outputs": describe(outputs[0]), "inputs": inputs}).encode()
-        except ValueError:  # an operation that cannot be exported, or outputs of a class of others
+            kept = _header(outputs[0], inputs) + bytes(trace)
+        except ValueError:  # an operation that cannot be exported, or outputs that cannot be pickled
             return None
-        kept = described + b"\n" + bytes(trace)
         write_cached(path, kept)
         return _load(kept, self._name)
 
 
 class Builds:
-    """Programs that are compiled side by side, while this thread traces the next one."""
+    """Programs that are compiled side by side, while this thread traces the next one; options are those of XLA."""
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(available_cores(), thread_name_prefix="compile")
-        self._running: list[Future[None]] = []
+    def __init__(self, threads: int | None = None, options: dict[str, Any] | None = None) -> None:
+        self._pool = ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="compile")
+        self._options, self._running = options, list[tuple[Compiled, Future[None]]]()
 
     def start(self, program: Compiled, *types: Any) -> None:
         """Trace a program, and begin to compile it for JAX's default device; see `Compiled.ahead`."""
-        self._running.append(self._pool.submit(program.ahead(*types)))
+        self._running.append((program, self._pool.submit(program.ahead(*types, options=self._options))))
 
-    def wait(self) -> None:
-        """Wait for all programs, so that what is timed afterwards has the machine to itself."""
+    def wait(self, program: Compiled | None = None) -> None:
+        """Wait for one program, or all, so that what is timed afterwards has the machine to itself."""
         with awaited():
-            while self._running:
-                self._running.pop(0).result()
+            for each in [each for each in self._running if program in (None, each[0])]:
+                self._running.remove(each)
+                each[1].result()
 
 
 def _calling(libraries: Iterable[str]) -> list[jax.export.DisabledSafetyCheck]:
@@ -298,6 +298,18 @@ def _say_untraceable(opaque: tuple[str, ...]) -> None:
     )
 
 
+def _header(structure: Any, inputs: Mapping[str, str]) -> bytes:
+    """Pickle the structure of the outputs and the inputs; ValueError if the structure is not the same afterwards."""
+    try:
+        header = pickle.dumps((structure.unflatten(range(structure.num_leaves)), inputs))
+        same = jax.tree.structure(pickle.loads(header)[0]) == structure
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(f"outputs of a class that cannot be pickled: {error}") from error
+    if not same:
+        raise ValueError("outputs with parts beside their leaves")
+    return header
+
+
 def _read(path: Path, name: str) -> Callable[..., Any] | None:
     """Load the function whose trace is in a file; None if the file is missing or unreadable, a library of native code
     that it calls is missing, or an input differs."""
@@ -309,10 +321,10 @@ def _read(path: Path, name: str) -> Callable[..., Any] | None:
 
 
 def _load(kept: bytes, name: str) -> Callable[..., Any] | None:
-    described, _, trace = kept.partition(b"\n")
-    found: Mapping[str, Any] = json.loads(described)
-    if inputs_now(found["inputs"]) != found["inputs"]:
+    stream = io.BytesIO(kept)
+    tree, inputs = pickle.load(stream)
+    if inputs_now(inputs) != inputs:
         return None
-    exported, structure = jax.export.deserialize(bytearray(trace)), restore(found["outputs"])
+    exported, structure = jax.export.deserialize(bytearray(stream.read())), jax.tree.structure(tree)
     call = lambda *arguments: structure.unflatten(exported.call(*jax.tree.leaves(arguments)))  # noqa: E731
     return jax.jit(_named(call, name), compiler_options=compiler_options())

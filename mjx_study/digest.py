@@ -60,7 +60,6 @@ CODE: Final = (type, types.FunctionType, types.BuiltinFunctionType, types.Method
 
 
 def digest_of(value: Any) -> str:
-    """Digest of a value, by content."""
     return Digest(value).hexdigest()
 
 
@@ -92,7 +91,6 @@ class Digest:
         return self.globals | {f"source of {name}": digest for name, digest in sorted(self.sources.digests.items())}
 
     def hexdigest(self) -> str:
-        """Return the digest as sixteen hexadecimal digits."""
         return self._sha.hexdigest()[:16]
 
     def add(self, value: Any) -> None:

@@ -77,7 +77,6 @@ def _figure(name: str, figure: Figure, drawings: Mapping[str, Drawing]) -> tuple
 
 
 def _summary(dataset: xr.Dataset) -> str:
-    """Explain the numbers in the table."""
     seeds, samples = dataset.sizes.get("seed", 1), int(dataset["samples"][-1])
     seed = f"Medians over {seeds} seeds, counts summed" if seeds > 1 else "One seed"
     return (

@@ -159,11 +159,6 @@ def processor() -> str:
     return "\n".join([*sorted(kept), platform.machine()])
 
 
-def processor_name() -> str:
-    names = [line.split(":", 1)[1].strip() for line in processor().splitlines() if line.startswith("model name")]
-    return names[0] if names else platform.machine()
-
-
 def precision() -> str:
     """float64 or float32, as JAX is configured."""
     return "float64" if jax.config.read("jax_enable_x64") else "float32"
@@ -172,10 +167,11 @@ def precision() -> str:
 def environment() -> dict[str, Any]:
     """Versions, machine, devices and precision: what results depend on besides their configuration."""
     names = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy")
+    models = [line.split(":", 1)[1].strip() for line in processor().splitlines() if line.startswith("model name")]
     return {
         "versions": {name: version_of(name) for name in names},
         "python": platform.python_version(),
-        "processor": processor_name(),
+        "processor": models[0] if models else platform.machine(),
         "cores": available_cores(),
         "devices": [str(device) for device in local_devices()],
         "backend": jax.default_backend(),

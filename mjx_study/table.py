@@ -78,7 +78,6 @@ def _to_decimals(value: float, decimals: int) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """Format a count with its noun."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
@@ -91,7 +90,6 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 
 def percent(share: float, digits: int = 0) -> str:
-    """Format a share as a percentage with so many decimals."""
     return f"{100 * share:.{digits}f} %"
 
 
@@ -135,9 +133,5 @@ def count(number: int) -> str:
 def size(number: int | float) -> str:
     """Format a number of bytes to two digits, in a suitable unit."""
     unit, least = next((each for each in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)) if number >= each[1]), ("bytes", 1))
-    return f"{_rounded(number / least)} {unit}"
-
-
-def _rounded(number: float | int) -> str:
-    two_digits = float(f"{number:.2g}")
-    return f"{two_digits:,.0f}" if two_digits >= 10 else f"{two_digits:g}"
+    rounded = float(f"{number / least:.2g}")
+    return f"{rounded:,.0f} {unit}" if rounded >= 10 else f"{rounded:g} {unit}"

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Final
 
 import jax
@@ -28,23 +28,22 @@ _ELSEWHERE: Final[list[int]] = []
 
 
 @contextmanager
-def awaited() -> Generator[None]:
+def _marked(marks: list[int]) -> Generator[None]:
+    marks.append(0)
+    try:
+        yield
+    finally:
+        marks.pop()
+
+
+def awaited() -> AbstractContextManager[None]:
     """Mark that a thread waits for computation of this process."""
-    _AWAITED.append(0)
-    try:
-        yield
-    finally:
-        _AWAITED.pop()
+    return _marked(_AWAITED)
 
 
-@contextmanager
-def elsewhere() -> Generator[None]:
+def elsewhere() -> AbstractContextManager[None]:
     """Mark that another process, such as a compiler, works for this one."""
-    _ELSEWHERE.append(0)
-    try:
-        yield
-    finally:
-        _ELSEWHERE.pop()
+    return _marked(_ELSEWHERE)
 
 
 def watch(complain: Callable[[str], None], seconds: int = SECONDS, tick: float = 1.0) -> None:

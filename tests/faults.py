@@ -1,4 +1,4 @@
-"""Faults on purpose: disks that fill up, processes that die at any system call, files that are none, wrong clocks.
+"""Faults on purpose: disks that fill up, processes that die at any system call, files that are none.
 
 Calls of the operating system that a write makes are counted, and the n-th one fails; or a process that writes is traced
 and killed at its n-th system call. Each test runs n through all of them.
@@ -21,8 +21,6 @@ from mjx_study.storage import cell_files
 
 CALLS: Final = ("open", "mkdir", "fsync", "fchmod", "replace")
 """Functions of `os` that change the disk; writes to open files count as well."""
-FUTURE: Final = 4_000_000_000
-"""The year 2096, in seconds since 1970."""
 PTRACE_TRACEME, PTRACE_SYSCALL = 0, 24
 
 
@@ -174,9 +172,3 @@ def put_no_file(path: Path, kind: str) -> None:
         path.mkdir()
     else:
         path.symlink_to("/dev/zero")
-
-
-def from_the_future(folder: Path) -> None:
-    """Dates everything in a folder to the year 2096."""
-    for path in [folder, *folder.rglob("*")]:
-        os.utime(path, (FUTURE, FUTURE))

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import estimators
-from estimators import ESTIMATORS, DiscontinuityGated, ZerothOrder, make_estimator, pull_back, truncated_first_order
+from estimators import ESTIMATORS, DiscontinuityGated, ZerothOrder, make_estimator
 from mjx_study.experiment.resolution import check_estimators
 from mjx_study.objective import Simulator, simulate
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 from tests.carts import cart, launched_cart, steered_cart
+from tests.estimators.statistics_helpers import assert_batches_agree
 
 # What each stands for: an open loop; feedback from random starts; parameters that act before the simulation.
 CARTS = {"cart": cart, "steered cart": steered_cart, "launched cart": launched_cart}
@@ -50,27 +51,8 @@ def drawn(request: pytest.FixtureRequest) -> tuple[Task, Any, dict[str, Any]]:
 def test_the_batches_agree(drawn) -> None:
     """Values, scores and gradients are the same whichever batch they are read from."""
     task, _, batches = drawn
-    evaluation, steps, differentiation = (batches[name] for name in ("evaluation", "steps", "differentiation"))
-    by_step, linearisation = batches["step_differentiation"], batches["linearisation"]
-    close = lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())  # noqa: E731
-    for value in (steps.value_to_go[:, 0], differentiation.value, by_step.value, linearisation.steps.value_to_go[:, 0]):
-        close(value, evaluation.value)
-    close(steps.baseline_to_go[:, 0], evaluation.baseline)
-    close(linearisation.steps.baseline_to_go, steps.baseline_to_go)
-    close(pull_back(steps.noise_score, steps.policy_jacobian), evaluation.score)
-    close(pull_back(by_step.noise_gradient, by_step.policy_jacobian), differentiation.gradient)
-    close(truncated_first_order(linearisation, task.horizon).per_sample, differentiation.gradient)
-    assert steps.noise_score.shape == (SAMPLES, *task.policy.noise_shape)
-    for plus, minus, whole in ((*batches["pair"], evaluation), (*batches["step_pair"], steps)):
-        for field in dataclasses.fields(whole):
-            one, other = getattr(plus, field.name), getattr(whole, field.name)
-            assert (one is None) == (other is None)
-            if one is not None:
-                close(one, other)
-        assert not np.allclose(
-            minus.score if hasattr(minus, "score") else minus.noise_score,
-            plus.score if hasattr(plus, "score") else plus.noise_score,
-        )
+    assert_batches_agree(batches, task.horizon)
+    assert batches["steps"].noise_score.shape == (SAMPLES, *task.policy.noise_shape)
 
 
 def test_costs_to_go_are_sums_of_remaining_costs(drawn) -> None:

@@ -5,14 +5,13 @@ All commands run in one process, which drops JAX's caches in memory between them
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any, Final
 
 import pytest
 
-ROOT: Final = Path(__file__).parents[1]
+from tests.processes import ROOT, run_script
+
 SCRIPT = """
 import contextlib, io, json, sys, threading
 import jax
@@ -56,9 +55,7 @@ def builds_of(folder: Path, *commands: str) -> list[dict[str, list[str]]]:
     """Names of the programs that commands compile, and traces of rollouts, in the user's folder."""
     environment: dict[str, Any] = os.environ | {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(ROOT)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    given = [sys.executable, "-c", SCRIPT, json.dumps(commands)]
-    done = subprocess.run(given, capture_output=True, text=True, cwd=folder, env=environment, timeout=900)
-    assert done.returncode == 0, done.stderr
+    done = run_script(SCRIPT, json.dumps(commands), cwd=folder, env=environment, timeout=900)
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 

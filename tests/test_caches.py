@@ -1,26 +1,18 @@
 """Caches on disk: private, checked before use, and remade if damaged."""
 
-import json
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-import optax
 import pytest
 
-from estimators import Differentiation
 from mjx_study import disk, runtime
 from mjx_study.caches import digested, read_cached, undigested, write_cached
 from mjx_study.disk import private_folder
 from mjx_study.runtime import configure, traces_folder
-from mjx_study.structure import describe, restore
 from tests.faults import deadline, put_no_file
+from tests.processes import run_script
 
 
 def test_a_digest_is_checked() -> None:
@@ -144,48 +136,5 @@ print(len(kept))
 
 def test_with_bits_flipped_in_every_file_of_the_cache_the_numbers_are_the_same(tmp_path: Path) -> None:
     """Programs, traces and libraries, none of which anybody else can read."""
-    command = [sys.executable, "-c", FLIPPED, str(tmp_path / "cache"), "2"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
-    assert done.returncode == 0, done.stderr
+    done = run_script(FLIPPED, tmp_path / "cache", "2")
     assert int(done.stdout) > 2 and "Error reading persistent" not in done.stderr
-
-
-# Structures.
-
-
-def test_a_structure_is_plain_data_and_comes_back() -> None:
-    state = optax.adam(0.1).init(jnp.zeros(3))
-    batch = Differentiation(jnp.zeros(2), jnp.zeros((2, 3)))
-    for tree in (0, None, (), [], {"b": 1, "a": (2, [None, 3])}, state, {"batch": batch, "state": [state]}):
-        structure = jax.tree.structure(tree)
-        assert restore(json.loads(json.dumps(describe(structure)))) == structure
-
-
-class Own(NamedTuple):
-    """A class of another package."""
-
-    value: Any
-
-
-@pytest.mark.parametrize("tree", [Own(1), {1: 2}, jax.tree_util.Partial(np.sin, 1)])
-def test_other_structures_are_refused(tree: Any) -> None:
-    with pytest.raises(ValueError, match="no part of a structure|parts beside its leaves"):
-        describe(jax.tree.structure(tree))
-
-
-@pytest.mark.parametrize(
-    ("described", "says"),
-    [
-        ("text", "not the description of a structure"),
-        ({"dict": {}, "more": 1}, "not the description of a structure"),
-        ({"set": []}, "not the description of a structure"),
-        ({"class": ["os", "system"], "fields": []}, "is no class of so many fields"),
-        ({"class": ["mjx_study.nowhere", "It"], "fields": []}, "is no class of so many fields"),
-        ({"class": ["tests.test_caches", "Own"], "fields": [0]}, "is no class of so many fields"),
-        ({"class": ["estimators.batches", "Differentiation"], "fields": [0]}, "is no class of so many fields"),
-        ({"class": ["mjx_study.disk", "os"], "fields": []}, "is no class of so many fields"),
-    ],
-)
-def test_other_descriptions_are_refused(described: Any, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        restore(described)

@@ -11,33 +11,17 @@ from typing import Any, NoReturn
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import options
-from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS, as_arguments
+from mjx_study.options.configuration import OPTIONS, as_arguments
 from mjx_study.plots.style import PAGE
 from mjx_study.results.rows import rows_of
 from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS
 from tests.documents import stages_of
+from tests.test_options import refused
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
 SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8", "--chunk-size", "4"]
-MJCF = """<mujoco><worldbody>
-  <body name="a"><joint name="{joint}" type="slide" axis="1 0 0"/>
-    <geom name="pusher" type="{geom}" size="0.5 0.5 0.5" mass="0.1"/></body>
-  <body name="b" pos="1 0 0"><joint name="slider" type="slide" axis="1 0 0" ref="1"/>
-    <geom name="slider" type="box" size="0.5 0.5 0.5" mass="0.1"/></body>
-</worldbody><actuator><motor joint="{joint}"/></actuator></mujoco>"""
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run, expect exit code 2 and one line on standard error, and return that line."""
-    assert cli.main(arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.count("\n") == 1, printed.err
-    assert "Traceback" not in printed.err
-    return printed.err
 
 
 @pytest.fixture(scope="module")
@@ -111,13 +95,6 @@ def test_warnings_about_the_contact_reach_the_reader(capsys: pytest.CaptureFixtu
     assert "warning: penalty, K = 10000 N/m: h^2 k" in capsys.readouterr().out
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["--version"])
-    assert stop.value.code == 0
-    assert capsys.readouterr().out.startswith("mjx-study 0.")
-
-
 def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["tasks"]) == 0
     printed = capsys.readouterr().out
@@ -127,13 +104,6 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(tasks) == list(TASKS)
     assert tasks["pusher"]["params"] == 200 and tasks["pusher"]["effective_mass"] == pytest.approx(0.05)
     assert tasks["double_pendulum"]["effective_mass"] is None
-
-
-def test_iterations_of_the_solver_and_of_a_descent_are_different_options() -> None:
-    parse = cli.parser().parse_args
-    parsed = parse(["optimise", "pusher", "--solver-iterations", "7", "--iterations", "5"])
-    assert as_arguments(options.given_options(parsed, *SCENE_OPTIONS)) == {"iterations": 7}
-    assert parsed.iterations == 5
 
 
 @pytest.mark.parametrize(
@@ -159,32 +129,9 @@ def test_every_command_about_a_task_overrides_the_options_of_its_mjcf(
     }
     flags = [text for name, value in given.items() for text in (OPTIONS[name].flag, str(value))]
     flags += ["--disable-flag", "warmstart,gravity", *(["--dry-run"] if command == "sweep" else [])]
-    assert "seen" in refused(capsys, command, "pusher", *flags)
+    assert "seen" in refused([command, "pusher", *flags], capsys)
     seen.pop("timestep", None)  # studies ask for the task's defaults first
     assert seen == as_arguments(given | {"timestep": None, "disable_flag": ("warmstart", "gravity")})
-
-
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        ("<mujoco><worldbody>", "is not a valid MJCF"),
-        (MJCF.format(joint="push", geom="sphere"), "no joint 'pusher'; did you mean push?"),
-        (MJCF.format(joint="pusher", geom="cylinder"), "MJX cannot run"),
-    ],
-    ids=["does not parse", "no such joint", "not for MJX"],
-)
-def test_bad_models_get_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, content: str, says: str) -> None:
-    path, untouched = tmp_path / "mine.xml", tmp_path / "out"
-    path.write_text(content)
-    assert says in refused(capsys, "compare", "pusher", *SMALL, "--model", str(path), "--output", str(untouched))
-    assert not untouched.exists()
-
-
-def test_an_output_folder_that_is_a_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    path = tmp_path / "taken"
-    path.write_text("mine")
-    assert "cannot write to the output folder" in refused(capsys, "compare", "pusher", "--output", str(path))
-    assert path.read_text() == "mine"
 
 
 def test_the_log_level_of_xla_is_the_users_where_it_is_set(monkeypatch: pytest.MonkeyPatch) -> None:

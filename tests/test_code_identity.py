@@ -2,8 +2,6 @@
 
 import hashlib
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +11,7 @@ from mjx_study.digest import FORMER, digest_of
 from mjx_study.identity import NOT_COMPUTING, computing_code, contents, differences
 from mjx_study.reference import MomentumTransfer
 from mjx_study.tasks import make_task
+from tests.processes import run_script
 from tests.test_layering import FILES, LAYERS, ROOT, module_of, read
 
 RUN = "mjx_study.execution.run"
@@ -66,9 +65,7 @@ def test_all_that_a_study_imports_counts() -> None:
 
 
 def test_all_that_a_study_loads_counts() -> None:
-    done = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    loaded = set(done.stdout.split()) & PATHS.keys()
+    loaded = set(run_script(LOADED).stdout.split()) & PATHS.keys()
     assert {"mjx_study", "mjx_study.objective"} <= loaded and not [name for name in loaded if not counts(PATHS[name])]
 
 

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -246,6 +246,16 @@ def test_statistics_are_compiled_for_the_batches_that_come(
     for samples in (6, 6, 5):  # the second time they are compiled; other sizes are padded to the same
         run_study(StudyConfig(tasks=("pusher",), estimators=names, samples=(samples,), **chosen))
     assert len(list(folder.glob("*.trace"))) == len(needs | {"differentiation"}) + 1
+
+
+def test_outputs_of_a_class_that_cannot_be_pickled_are_traced_anew(folder: Path):
+    class Own(NamedTuple):
+        value: Any
+
+    assert Compiled(lambda x: Own(2 * x), "own")(1.0).value == 2.0 and not list(folder.glob("*.trace"))
+    for _ in range(2):
+        assert Compiled(lambda x: {"a": (2 * x, [None, x])}, "ours")(1.0) == {"a": (2.0, [None, 1.0])}
+    assert len(list(folder.glob("*.trace"))) == 1
 
 
 def test_names_say_which_settings_do_not_count():

@@ -18,8 +18,7 @@ from mjx_study.diagnose.advice import advise
 from mjx_study.diagnose.means import along_means
 from mjx_study.diagnose.measurement import ESTIMATORS, Measured, affordable, chunk_of
 from mjx_study.diagnose.page import document_of, page_lines
-from mjx_study.diagnose.result import Diagnosis
-from mjx_study.diagnose.run import diagnose_task
+from mjx_study.diagnose.run import Diagnosis, diagnose_task
 from mjx_study.diagnose.setting import setting_of
 from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.gradcheck import Finding

@@ -29,19 +29,8 @@ OF_KIND = {"--iterations": "--iterations 2 --evaluation-samples 4", "--points": 
 # What a page takes for granted, or another one makes.
 MJCF = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
 <body pos="0 0 0.09"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
-ORDER = (
-    "init",
-    "optimise",
-    "rollout",
-    "compare",
-    "landscape",
-    "gradcheck",
-    "diagnose",
-    "bench",
-    "claims",
-    "sweep",
-    "plot",
-    "report",
+ORDER: tuple[str, ...] = tuple(
+    "init optimise rollout compare landscape gradcheck diagnose bench claims sweep plot report".split()
 )
 
 

@@ -19,6 +19,7 @@ from mjx_study.execution.run import run_study
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.results.variables import GRADIENTS
 from tests.documents import content, stages_of, stub_cells
+from tests.processes import run_script
 
 SIGNALS = """
 import os, signal, sys, time
@@ -42,8 +43,7 @@ print("goes on")
 
 
 def test_a_signal_ends_a_command_with_one_line_and_its_code() -> None:
-    done = subprocess.run([sys.executable, "-c", SIGNALS], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    done = run_script(SIGNALS)
     assert done.stdout.split("\n")[:4] == ["130", "143", "129", "goes on"]
     words = ("interrupted", "terminated", "hung up")
     said = [line for line in done.stderr.splitlines() if line.startswith("mjx-study: ")]
@@ -69,9 +69,11 @@ with output.computing():
 """
 
 
-@pytest.mark.parametrize("state", ["gone", "full", "closed"])
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_ends_a_command_that_cannot_say_so(state: str, number: signal.Signals, code: int) -> None:
+@pytest.mark.parametrize(
+    ("state", "number"),
+    [("gone", signal.SIGTERM), ("full", signal.SIGTERM), ("closed", signal.SIGTERM), ("gone", signal.SIGHUP)],
+)
+def test_a_signal_ends_a_command_that_cannot_say_so(state: str, number: signal.Signals) -> None:
     """The reader of standard error has gone, does not read, or there never was one."""
     read, write = os.pipe()
     command = [sys.executable, "-c", UNREAD, "-", state]
@@ -82,27 +84,18 @@ def test_a_signal_ends_a_command_that_cannot_say_so(state: str, number: signal.S
         if state == "gone":
             os.close(read)
         running.send_signal(number)
-        assert running.wait(timeout=4) == code
+        assert running.wait(timeout=4) == 128 + number
     if state != "gone":
         os.close(read)
 
 
-COMMANDS = """
-import sys
-from mjx_study.cli import main
-
-study = "compare pusher --contact reference --stiffness 10 --horizon 2 --samples 4 --reference-samples 8 --output"
-for command in (study.split(), ["plot"], ["report"]):
-    assert main([*command, sys.argv[1]]) == 0, command
-"""
-
-
-def test_names_of_folders_need_not_be_utf_8(tmp_path: Path) -> None:
+def test_names_of_folders_need_not_be_utf_8(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every file of a study can be read again, and holds the command that wrote it."""
-    folder = os.fsencode(tmp_path) + b"/out\xff"
-    done = subprocess.run([sys.executable, "-c", COMMANDS, folder], capture_output=True)
-    assert done.returncode == 0, done.stderr
-    page = (Path(os.fsdecode(folder)) / "report.html").read_text()
+    folder = os.fsdecode(os.fsencode(tmp_path) + b"/out\xff")
+    study = "compare pusher --contact reference --stiffness 10 --horizon 2 --samples 4 --reference-samples 8 --output"
+    for command in (study.split(), ["plot"], ["report"]):
+        assert cli.main([*command, folder]) == 0, capsys.readouterr().err
+    page = (Path(folder) / "report.html").read_text()
     assert r"--output &#39;" in page and r"out\udcff" in page
 
 

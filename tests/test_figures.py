@@ -9,13 +9,11 @@ import pytest
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgb
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from estimators import ESTIMATORS
 from mjx_study._matplotlib import matplotlib
-from mjx_study.plots.edges import UNDRAWN
-from mjx_study.plots.panels import UNSTABLE
+from mjx_study.plots.panels import UNDRAWN, UNSTABLE
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import STYLES, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report
@@ -73,10 +71,10 @@ def legend_of(figure: Figure) -> list[str]:
 
 
 def test_titles_and_labels_fit_their_axes_on_paper() -> None:
-    models = [(family, stiffness) for family in FAMILIES for stiffness in (10.0, 100.0, 1000.0)]
+    models = [(family, stiffness) for family in FAMILIES for stiffness in (10.0, 1000.0)]
     several = {"seeds": 3, "squared_bias": 0.5, "squared_bias_se": 0.1}
     studies = [study("gradients", models), study("gradients", models, **several), study("descents", models),
-               study("landscapes", models)]  # fmt: skip
+               study("landscapes", models[::2])]  # fmt: skip
     with matplotlib.rc_context(STYLES["paper"]):
         for found in studies:
             for name, figure in plot_study(found).items():
@@ -109,19 +107,6 @@ def test_curves_and_intervals_beyond_the_limits_are_marked() -> None:
     assert len(heads) == 4
     boxes = [(each.get_window_extent(), each.get_marker()) for each in heads]
     assert all(box.y0 > axes.bbox.y1 if shape == "^" else box.y1 < axes.bbox.y0 for box, shape in boxes)
-
-
-def test_no_estimator_is_black_or_grey() -> None:
-    """Which mean costs and references are."""
-    assert min(np.ptp(to_rgb(colour)) for _, colour, _ in map(style_of, ESTIMATORS)) > 0.3
-
-
-def test_a_long_stretch_beyond_the_limits_is_marked_once() -> None:
-    figure, axes = bare()
-    axes.plot(range(100), np.where(np.arange(100) < 50, 1, 20), color="#112233")
-    axes.set_ylim(0, 10)
-    mark_clipped(figure)
-    assert marks(axes, "^") == [(75.0, "#112233")]
 
 
 def test_every_kind_of_figure_marks_what_its_limits_clip() -> None:
@@ -227,17 +212,10 @@ def test_negative_costs_have_no_ratio_and_no_map() -> None:
         assert ("map_stiffness_sigma" in figures) == drawn
 
 
-def test_one_stiffness_gives_an_axis_of_families_and_two_are_not_joined() -> None:
+def test_one_stiffness_gives_an_axis_of_families() -> None:
     """Warnings are errors here: an axis of one stiffness had identical limits."""
     (figure,) = plot_study(study("gradients", [(family, 1000.0) for family in FAMILIES])).values()
-    assert len(figure.axes) == 2
-    labels = [label.get_text() for label in figure.axes[1].get_xticklabels()]
-    assert len(labels) == len(FAMILIES) and labels[-1].replace("\N{NO-BREAK SPACE}", " ") == "smooth onset,\n1,000 N/m"
-    (figure,) = plot_study(study("gradients", [("penalty", 300.0), ("penalty", 3000.0)])).values()
-    for axes in figure.axes:
-        lines = [line for line in axes.lines if np.size(line.get_xdata()) == 2 and line.get_marker() != "None"]
-        assert lines and all(line.get_linestyle() == "None" for line in lines)
-        assert all(np.shape(path.vertices) == (2, 2) for each in axes.collections for path in each.get_paths())  # bars
+    assert len(figure.axes) == 2 and len(figure.axes[1].get_xticklabels()) == len(FAMILIES)
 
 
 def numbers_of(found: xr.Dataset) -> dict[tuple[str, ...], list[list[str]]]:

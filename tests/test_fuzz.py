@@ -9,10 +9,9 @@ import pytest
 from mjx_study import caches
 from mjx_study.experiment import plan as plan_module
 from mjx_study.storage import manifest as document
-from tests.fuzz import FUZZERS, flips, fuzz, strategies, studies
-from tests.fuzz.__main__ import BEGIN, END, cells, markdown, put_into
-from tests.fuzz.answers import OutsideError, Row, SilentError, TooSlow, answer
-from tests.fuzz.cases import CASES
+from tests.fuzz import FUZZERS, flips, fuzz, studies
+from tests.fuzz.__main__ import BEGIN, END, markdown, put_into
+from tests.fuzz.answers import Row, TooSlow, WrongError, answer
 from tests.fuzz.forgeries import FORGERIES
 from tests.fuzz.planning import fuzzed_folder
 
@@ -31,7 +30,7 @@ def test_a_few_inputs_get_an_answer(kind: str, root: Path, monkeypatch: pytest.M
     monkeypatch.setattr(flips, "DRAWN", 36)
     wanted = SAMPLE.get(kind, 8)
     row = fuzz(kind, root, wanted / FUZZERS[kind][1])
-    assert row.inputs == wanted and row.wrong == 0, row.told
+    assert row.inputs == wanted and not row.wrong
 
 
 @pytest.mark.slow
@@ -39,28 +38,18 @@ def test_a_few_inputs_get_an_answer(kind: str, root: Path, monkeypatch: pytest.M
 def test_thousands_of_inputs_get_an_answer(kind: str, root: Path) -> None:
     """Some are refused."""
     row = fuzz(kind, root)
-    assert row.wrong == 0, row.told
+    assert not row.wrong
     assert row.codes[2] > row.inputs / 20
 
 
-def test_enough_is_tried() -> None:
-    """Of every command too, about as often as of any other."""
-    counts = {kind: count for kind, (_, count) in FUZZERS.items()}
-    assert sum(counts[kind] for kind in CASES) >= 4000 and sum(counts[kind] for kind in flips.FLIPS) >= 1000
-    assert sum(counts[kind] for kind in FORGERIES) >= 100
-    assert counts["options of every command"] >= 100 * len(strategies.COMMANDS)
-
-
-def test_every_wrong_answer_has_its_column() -> None:
+def test_every_wrong_answer_is_counted() -> None:
     row = Row("options")
-    errors = SilentError("a"), KeyError("b"), TooSlow(), OutsideError("c")
-    for error in errors:
+    for error in (WrongError("a"), KeyError("b"), TooSlow()):
         with row.counting(["compare"]):
             raise error
     with row.counting(["compare"]):
         pass
-    assert cells(row) == ["options", "5", "1", "1", "1", "1"] and row.wrong == 4
-    assert row.told[0] == "options: ['compare']: SilentError a"
+    assert row.inputs == 4 and len(row.wrong) == 3 and row.wrong[0] == "options: ['compare']: WrongError a"
     with pytest.raises(KeyboardInterrupt), row.counting(["compare"]):
         raise KeyboardInterrupt
 
@@ -68,7 +57,7 @@ def test_every_wrong_answer_has_its_column() -> None:
 def test_the_table_goes_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(f"before\n{BEGIN}old\n{END}after\n")
-    table = markdown([Row("options", 1200, silent=3), Row("files", 7)])
+    table = markdown([Row("options", 1200, wrong=["a", "b", "c"]), Row("files", 7)])
     put_into(page, table)
     put_into(page, table)
     assert page.read_text() == f"before\n{BEGIN}\n{table}\n{END}after\n"
@@ -93,7 +82,7 @@ def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pyt
 
     for error in (KeyError("theta"), SystemExit(0), TooSlow()):
         monkeypatch.setattr(plan_module, "plan_study", broken(error))
-        with pytest.raises((KeyError, SilentError, TooSlow)):
+        with pytest.raises((KeyError, WrongError, TooSlow)):
             answer(["compare", "pusher"], folder)
 
     def touching(*_: Any, **__: Any) -> None:
@@ -101,20 +90,20 @@ def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pyt
         raise ValueError("and refuses")
 
     monkeypatch.setattr(plan_module, "plan_study", touching)
-    with pytest.raises(OutsideError, match="a file was touched"):
+    with pytest.raises(WrongError, match="a file was touched"):
         answer(["compare", "pusher"], folder)
-    with pytest.raises(SilentError, match="exit code 2 of"):
+    with pytest.raises(WrongError, match="exit code 2 of"):
         answer(["compare", "nobody"], folder, refuse=False)
 
 
 def test_a_flip_that_is_believed_is_counted(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without digests, flips change content."""
     monkeypatch.setattr(caches, "undigested", lambda content: content[caches.LENGTH :])
-    assert flips.flip("bit flips in files of caches", 1, root).silent == 1
+    assert flips.flip("bit flips in files of caches", 1, root).wrong
 
 
 def test_a_flip_that_changes_a_study_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the digest of study.json, other texts and numbers are read."""
     monkeypatch.setattr(document, "digest_of_json", lambda _: "0")
     monkeypatch.setattr(studies, "STUDIES", {"landscapes": studies.STUDIES["landscapes"]})
-    assert flips.flip("bit flips in files of studies", 40, tmp_path).silent >= 1
+    assert flips.flip("bit flips in files of studies", 40, tmp_path).wrong

@@ -168,7 +168,7 @@ def test_a_study_of_another_precision_is_refused(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.usefixtures("stubbed")
-def test_a_study_whose_model_or_task_changed_is_refused(tmp_path: Path, own: Callable[..., Task]) -> None:
+def test_a_study_whose_model_changed_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "own.xml"
     text = (models_folder() / "pusher.xml").read_text()
     path.write_text(text)
@@ -176,11 +176,6 @@ def test_a_study_whose_model_or_task_changed_is_refused(tmp_path: Path, own: Cal
     path.write_text(re.sub(r'timestep="[^"]*"', 'timestep="0.004"', text))
     with pytest.raises(StudyError, match="holds another study .model of pusher "):
         swept(tmp_path / "out", model=str(path))
-    own()
-    swept(tmp_path / "hops", tasks=("hopping:hop",))
-    own(bias=3.0)
-    with pytest.raises(StudyError, match="another study .task hopping:hop .*, source of hopping.py "):
-        swept(tmp_path / "hops", tasks=("hopping:hop",))
 
 
 def other_jax(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,26 +97,32 @@ def loaded(path: Path) -> ModuleType:
     return module
 
 
-@pytest.fixture
-def begin(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[Task, dict[str, Any], Path]]:
-    """Runs init on an MJCF of that name, and returns the task, the document and the file."""
+Begun = tuple[Task, dict[str, Any], Path, Proposal]
 
-    def begin(source: str, name: str = "model.xml") -> tuple[Task, dict[str, Any], Path]:
+
+@pytest.fixture
+def begin(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Begun]:
+    """Runs init on an MJCF of that name, and returns the task, the document, the file and the proposal."""
+    proposals = []
+    monkeypatch.setattr(proposal, "propose", lambda scene: proposals.append(propose(scene)) or proposals[-1])
+
+    def begin(source: str, name: str = "model.xml") -> Begun:
         mjcf = tmp_path / name
         mjcf.write_text(source)
         assert cli.main(["init", str(mjcf), "--json"]) == 0
         document = json.loads(capsys.readouterr().out)
         (written,) = map(Path, document["written"])
         assert written.parent == tmp_path and written.stem == document["task"].partition(":")[0]
-        return getattr(loaded(written), document["task"].partition(":")[2])(), document, written
+        task = getattr(loaded(written), document["task"].partition(":")[2])()
+        return task, document, written, proposals[-1]
 
     return begin
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_every_model_gets_a_task(name: str, begin: Callable[..., tuple[Task, dict[str, Any], Path]]) -> None:
+def test_every_model_gets_a_task(name: str, begin: Callable[..., Begun]) -> None:
     """Its parts fit together, its cost is finite, and noise changes it; the file is formatted and has no long lines."""
-    task, document, written = begin(MODELS[name], f"{name}.xml")
+    task, document, written, found = begin(MODELS[name], f"{name}.xml")
     check_shapes(task)
     check_soundness(task)
     host = task.scene.host
@@ -129,7 +135,6 @@ def test_every_model_gets_a_task(name: str, begin: Callable[..., tuple[Task, dic
         low, high = task.defaults.stiffnesses[0], task.defaults.stiffnesses[-1]
         assert len(set(task.defaults.stiffnesses)) == 4 and high >= 5 * low
         assert 0.3 < task.scene.timestep * math.sqrt(high / effective_mass(task.scene, *task.contact_pair)) < 0.8
-    found = propose(load_scene(written.with_name(f"{name}.xml")))
     moves = (way * np.full((1, found.drive.size), found.drive.scale) for way in (-1, 1))
     misses = [found.aim.misses(proposal.run_trial(found.drive, move, found.horizon), found.horizon) for move in moves]
     assert np.std(misses) > 0 and all(math.isfinite(each) for each in misses)
@@ -140,10 +145,9 @@ def test_every_model_gets_a_task(name: str, begin: Callable[..., tuple[Task, dic
         assert done.returncode == 0, done.stdout + done.stderr + written.read_text()
 
 
-def test_the_cost_is_that_of_the_test_rollouts(begin: Callable[..., tuple[Task, dict[str, Any], Path]]) -> None:
+def test_the_cost_is_that_of_the_test_rollouts(begin: Callable[..., Begun]) -> None:
     """The file's cost of a rollout in C is the proposal's."""
-    task, _, written = begin(ARM, "arm.xml")
-    found = propose(load_scene(written.with_name("arm.xml")))
+    task, _, written, found = begin(ARM, "arm.xml")
     change = np.full((1, 2), 0.3)
     trial = proposal.run_trial(found.drive, change, task.horizon)
     state = initial_state(task.scene)
@@ -221,10 +225,8 @@ def test_a_model_without_a_task_gets_a_reason(
         propose(load_scene(path))
 
 
-def test_a_file_is_only_replaced_by_force(
-    begin: Callable[..., tuple[Task, dict[str, Any], Path]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    _, _, written = begin(PENDULUM)
+def test_a_file_is_only_replaced_by_force(begin: Callable[..., Begun], capsys: pytest.CaptureFixture[str]) -> None:
+    _, _, written, _ = begin(PENDULUM)
     written.write_text("mine")
     mjcf = str(written.with_name("model.xml"))
     assert cli.main(["init", mjcf]) == 2 and written.read_text() == "mine"

@@ -27,7 +27,7 @@ from mjx_study.experiment.quadrature import Line, applies, closed_form, grid, me
 from mjx_study.experiment.resolution import line_of
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
-from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
+from mjx_study.reference import BallWall, FunctionObjective, Heaviside, smoothed
 from mjx_study.results.curves import curves_of
 from mjx_study.results.kind import findings_of
 from mjx_study.simulation.dynamics import State
@@ -37,6 +37,7 @@ from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback
 from mjx_study.tasks.task import Task
 from tests.carts import WALL, cart
 from tests.documents import altered, numbers_of
+from tests.reference.functions import Square
 
 POSITION = np.linspace(0.1, 1.4, 7)
 SIGMA = 0.1
@@ -50,10 +51,7 @@ HALF_LINES = ((-np.inf, 0.0), (0.0, np.inf))
 
 
 @pytest.mark.parametrize("noise", NOISES)
-@pytest.mark.parametrize(
-    ("function", "tolerance"),
-    [(Quadratic(np.array([[3.0]]), np.array([-1.0])), 1e-4), (Heaviside(), 2e-2), (BallWall(), 2e-2)],
-)
+@pytest.mark.parametrize(("function", "tolerance"), [(Square(), 1e-4), (Heaviside(), 2e-2), (BallWall(), 2e-2)])
 def test_quadrature_against_closed_forms(function, tolerance: float, noise: str) -> None:
     """Smooth functions to the reach of the grid; where f jumps, to spacing times density, as the error bound says."""
     points = grid(POSITION[0], POSITION[-1], SIGMA, 4000, noise)

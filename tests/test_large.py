@@ -1,5 +1,6 @@
 """Gradients of more samples than are held at once: in blocks, whose merged statistics are those of the whole batch."""
 
+import json
 import os
 import signal
 import subprocess
@@ -202,7 +203,7 @@ def test_a_block_that_fails_takes_its_cell_with_it_and_no_other(workers: Any, tm
     asked = config(tasks=("tests.poison:poison",), stiffness=(RAISE, SLOW), samples=(16,), horizon=None)
     found = run_study(asked, tmp_path, cluster=workers)
     assert found.attrs["computed_cells"] == 1 == found.attrs["missing_cells"]
-    assert list(Store.open(tmp_path).failures.values()) == ["MemoryError: no memory for the batch"]
+    assert list(json.loads(found.attrs["failed_cells"]).values()) == ["MemoryError: no memory for the batch"]
     account = Path(workers.submit(os.environ.get, ACCOUNT, pure=False).result()).read_text().split()
     assert TRIES <= account.count(str(RAISE)) < 5 * TRIES
 

@@ -16,7 +16,7 @@ import pytest
 
 import mjx_study as study
 from mjx_study import cli
-from mjx_study.bench import plan_bench, run_bench
+from mjx_study.bench import run_bench
 from mjx_study.choices import laws_of
 from mjx_study.execution.run import run_study
 from mjx_study.graph import scalars
@@ -199,7 +199,7 @@ def test_the_graph_has_the_packages_own_derivative(law: str, monkeypatch: pytest
 @pytest.mark.slow
 def test_bench_leaves_out_rivals_of_another_law() -> None:
     defaults = study.StudyDefaults(stiffnesses=(100.0,), families=("hunt_crossley",))
-    report = run_bench(plan_bench(make_task("pusher", horizon=3).replace(defaults=defaults), 6))
+    report = run_bench(make_task("pusher", horizon=3).replace(defaults=defaults), 6)
     assert report.contact.startswith("hunt_crossley")
     assert set(report.ratios) == {"gradient_per_value", "onset_per_gradient"}
     assert any("left out" in line for line in report.lines())

@@ -2,16 +2,13 @@
 
 import ast
 import re
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
-from mjx_study.choices import TASK_DESCRIPTIONS
+from tests.processes import ROOT, run_script
 
-ROOT = Path(__file__).resolve().parents[1]
 # From the bottom up; a package or module may import from its own layer and from those above it in this list.
 LAYERS = [
     "estimators",
@@ -35,7 +32,6 @@ LAYERS = [
     "mjx_study.sources",
     "mjx_study.digest",
     "mjx_study.identity",
-    "mjx_study.structure",
     "mjx_study.compiled",
     "mjx_study.objective",
     "mjx_study.gradcheck",
@@ -109,10 +105,10 @@ def refused(module: str, imported: set[str]) -> set[str]:
     return wrong
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_point_down(path: Path) -> None:
-    wrong = refused(module_of(path), read(path))
-    assert not wrong, f"{module_of(path)} imports {sorted(wrong)}, of a later layer"
+def test_imports_point_down() -> None:
+    """A module that imports from a later layer is named, with what it imports."""
+    wrong = {module_of(path): refused(module_of(path), read(path)) for path in FILES}
+    assert {module: names for module, names in wrong.items() if names} == {}
 
 
 def cycle(imports: Mapping[str, set[str]]) -> list[str]:
@@ -164,25 +160,7 @@ def test_the_walk_sees(module: str, source: str, wrong: set[str]) -> None:
     assert refused(module, imports_of(source, module, is_package=False)) == wrong
 
 
-STABLE = "mjx_study.gradcheck.check.gradcheck"
-BUILDERS = {f"mjx_study.tasks.{name}.{name}" for name in TASK_DESCRIPTIONS}
-"""Their names are in the digests by which the folder of a study is recognised."""
-
-
-def namesakes(module: str, source: str) -> set[str]:
-    """Public functions of a module that have its name, or that of a package around it."""
-    functions = {node.name for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
-    return {f"{module}.{name}" for name in functions.intersection(module.split("."))}
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_function_hides_its_module(path: Path) -> None:
-    assert namesakes(module_of(path), path.read_text()) <= {STABLE, *BUILDERS}
-
-
-def test_namesakes_and_missing_layers_are_found() -> None:
-    source = "class Report: ...\ndef report(): ...\ndef _page(): ..."
-    assert namesakes("mjx_study.report.page", source) == {"mjx_study.report.page.report"}
+def test_a_missing_layer_is_found() -> None:
     with pytest.raises(LookupError, match="mjx_study.surprise is in no layer"):
         layer_of("mjx_study.surprise")
 
@@ -205,9 +183,7 @@ assert not jax._src.xla_bridge.backends_are_initialized(), "a backend was starte
 def test_import_has_no_global_effect() -> None:
     """In a fresh process: no change of JAX's configuration or of the environment, nothing printed."""
     modules = [module_of(path) for path in FILES if path.name != "__main__.py"]
-    done = subprocess.run([sys.executable, "-c", IMPORT_ALL, *modules], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == ""
+    assert run_script(IMPORT_ALL, *modules).stdout == ""
 
 
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mjx_study import cli
-from mjx_study.bench import plan_bench
+from mjx_study.bench import check_bench
 from mjx_study.diagnose.run import diagnose_task
 from mjx_study.execution.lost import first_nonfinite
 from mjx_study.experiment.plan import plan_study
@@ -101,7 +101,7 @@ def test_what_cannot_be_studied_is_refused_before_it_is_compiled(name: str) -> N
     for plan in (
         check_soundness,
         lambda task: plan_study(StudyConfig(tasks=(task,), contact=("mjcf",))),
-        lambda task: plan_bench(task, 10),
+        lambda task: check_bench(task, 10),
         lambda task: diagnose_task("falling", task),
     ):
         with pytest.raises(ValueError, match=message):

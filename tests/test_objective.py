@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from estimators import AlphaOrder, Differentiation, Evaluation, Objective, estimate, first_order, zeroth_order
+from estimators import AlphaOrder, Evaluation, draw, first_order, zeroth_order
+from estimators.sampling import sample_keys as keys_of_orders
 from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
 from mjx_study.runtime import local_devices
 from mjx_study.simulation import constraint, dynamics
@@ -162,34 +163,11 @@ def test_evaluating_never_differentiates_the_dynamics(monkeypatch):
     np.testing.assert_array_equal(alone.score, both.score)
 
 
-@dataclasses.dataclass
-class Recorded:
-    """An objective that remembers its batches."""
-
-    inner: Objective
-    evaluated: list[tuple[np.ndarray, Evaluation]] = dataclasses.field(default_factory=list)
-    differentiated: list[tuple[np.ndarray, Differentiation]] = dataclasses.field(default_factory=list)
-
-    @property
-    def num_params(self) -> int:
-        return self.inner.num_params
-
-    def evaluate(self, theta, keys) -> Evaluation:
-        self.evaluated.append((np.asarray(jax.random.key_data(keys)), self.inner.evaluate(theta, keys)))
-        return self.evaluated[-1][1]
-
-    def differentiate(self, theta, keys) -> Differentiation:
-        self.differentiated.append((np.asarray(jax.random.key_data(keys)), self.inner.differentiate(theta, keys)))
-        return self.differentiated[-1][1]
-
-
 def test_batches_of_an_interpolated_estimate_are_independent(simulator):
     """Noise of the zeroth-order batch against that of the first-order batch: 50 x 200 pairs, correlation 0 +- 1e-2."""
-    task, recorded = pusher_task(), Recorded(simulator.objective(penalty(10.0)))
-    estimate(AlphaOrder(gamma=task.defaults.gamma), recorded, task.theta, jax.random.key(0), 50)
-    ((zeroth_keys, zeroth),), ((first_keys, first),) = recorded.evaluated, recorded.differentiated
-    assert not {tuple(key) for key in zeroth_keys} & {tuple(key) for key in first_keys}
-    replayed = recorded.inner.evaluate(task.theta, jax.random.wrap_key_data(jnp.asarray(first_keys)))
+    objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
+    zeroth, first = draw(AlphaOrder.needs, objective, theta, jax.random.key(0), 50).values()
+    replayed = objective.evaluate(theta, keys_of_orders(jax.random.key(0), 50)[1])
     np.testing.assert_array_equal(replayed.value, first.value)  # so its scores hold the first-order batch's noise
     correlation = np.corrcoef(np.ravel(zeroth.score), np.ravel(replayed.score))[0, 1]
     assert abs(correlation) < 4 / np.sqrt(50 * HORIZON)
@@ -449,14 +427,3 @@ def test_batches_refuse(simulator, name: str, sigma: float | None, params: int, 
 def test_tasks_and_simulators_refuse(make, message: str):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_the_form_of_gradients_follows_from_that_of_values() -> None:
-    simulator = pusher_simulator()
-    for name in ("gradient", "corrected"):
-        arguments = simulator._chunk(pusher_task().theta, penalty(10.0), SIGMA)
-        traced = simulator._programs[name].outputs(*arguments)
-        found = simulator.form(name, pusher_task().theta, penalty(10.0), SIGMA)
-        assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), found) == jax.tree.map(
-            lambda leaf: (leaf.shape, leaf.dtype), traced
-        )

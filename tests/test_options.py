@@ -34,6 +34,7 @@ def configured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The one line with which a command refuses its arguments, before it prints or writes anything."""
     before = set(Path().iterdir())
+    capsys.readouterr()
     assert cli.main(arguments) == 2
     printed = capsys.readouterr()
     assert printed.err.count("\n") == 1 and printed.out == "" and set(Path().iterdir()) == before
@@ -45,14 +46,10 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     [
         ("samples", "-5", -5, "must be at least 3 and at most 10000000, got -5"),
         ("samples", "many", "many", "must be a whole number, got 'many'"),
-        ("samples", "2.5", 2.5, "must be a whole number, got "),
-        ("samples", "1e400", None, "must be at most 1.8e+308 in size, got '1e400'"),
         ("seed", "1e26", 10**26, "must be at least 0 and at most 4294967295, got "),
-        ("horizon", "-1", -1, "must be at least 1 and at most 1000000, got -1"),
         ("horizon", "true", True, "must be a whole number, got "),
         ("sigma", "nan", None, "must be positive and finite, got nan"),
         ("stiffness", "10,-5", -5.0, "must be positive and finite, got -5"),
-        ("stiffness", "1,1e400", None, "must be at most 1.8e+308 in size, got '1e400'"),
         ("stiffness", "1:1e9:1000000000", None, "takes at most 10000 values, got the range '1:1e9:1000000000'"),
         ("stiffness", "ten", "ten", "must be a number, got 'ten'"),
         *(
@@ -62,8 +59,6 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
                          "1e-300:1e300:3:log")
         ),
         ("gamma", "0", 0.0, "must be positive, got 0"),
-        ("gamma", "big", "big", "must be a number, got 'big'"),
-        ("theta", "inf", None, "must be finite, got inf"),
         ("radius", "huge", "huge", "does not accept 'huge'; choose from max_deviation, or give a number"),
         ("cone", "square", "square", "does not accept 'square'; choose from pyramidal, elliptic"),
         ("estimators", "zobg,fobgg", "fobgg", "does not accept 'fobgg'; did you mean fobg?"),
@@ -181,7 +176,6 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("compare pusher --samples=--", "--samples needs a value, got --"),
         ("compare pusher --precision float16", "argument --precision: unknown precision 'float16'; did"),
         ("compare pusher --devices 1000000", "--devices must be at least 1 and at most 256, got 1000000"),
-        ("compare pusher --cone elliptic", "MJX cannot run pusher: condim=1 with ConeType.ELLIPTIC"),
         ("compare pusher --model tennis_racket", "no model named 'tennis_racket'; did you mean tennis?"),
         ("compare pusher --accept-versions", "--accept-versions needs a folder for the study: give --output"),
         ("compare pusher --theta nowhere.npy", "cannot read nowhere.npy: No such file or directory"),
@@ -189,14 +183,9 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("sweep --output out", "no task: name one, or give --config"),
         ("sweep pusher --config nowhere.toml --output out", "cannot read nowhere.toml: No such file or directory"),
         ("sweep pusher --cluster local:0 --output out", "argument --cluster: must be local:N, slurm:N or an address"),
-        ("sweep pusher --cluster localhost:1 --output out", "argument --cluster: must be local:N, slurm:N or an addr"),
-        ("sweep pusher --cluster slurm:x --output out", "argument --cluster: must be local:N, slurm:N or an address"),
-        ("optimise double_pendulum --reference --stiffness 3", "--stiffness has no effect: double_pendulum names no"),
-        ("optimise pusher --reference --window 3", "--window has no effect on zobg, fobg, aobg: omit it"),
         ("optimise pusher --reference --contact penalty", "--contact penalty is what --reference replaces: omit one"),
         ("optimise pusher --seeds 100000", "GiB of memory, and the limit is 16 GiB"),
         ("optimise pusher --network 100000,100000", "parameters of a network are planned, and the limit is 10000000"),
-        ("landscape pusher --gamma 3", "--gamma has no effect on zobg, fobg: omit it, or choose an estimator that it"),
         ("landscape pusher --contact reference --no-reference", "--contact reference is what --no-reference omits"),
         ("gradcheck pusher --contact", "argument --contact: expected one argument"),
         ("gradcheck pusher --contact reference", "--contact does not accept 'reference'; choose from penalty"),
@@ -214,10 +203,7 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("rollout pusher --view zx", "argument --view: unknown view 'zx'; choose from auto, xz"),
         ("rollout pusher --seed 3", "--seed has an effect only with --noisy, as the initial state is fixed"),
         ("rollout pusher --sigma 0.2", "--sigma has an effect only with --noisy"),
-        ("rollout pusher --contact mjcf --stiffness 3", "--stiffness has no effect on contact mjcf: omit it, or add "),
         ("rollout rod.xml --contact penalty --noisy", "--contact is for a task: rod.xml moves as its MJCF says"),
-        ("diagnose pusher --contact mujoco_default --damping 3", "--damping has no effect on contact mujoco_default"),
-        ("bench pusher --samples 0", "--samples must be at least 1 and at most 10000000, got 0"),
         ("claims --accept-versions", "--accept-versions needs the folder to resume: give --output"),
         ("claims --only nothing", "unknown claim 'nothing'; choose from "),
         ("plot nowhere --format gif", "--format does not accept 'gif'; choose from png, pdf, svg"),
@@ -310,11 +296,6 @@ def test_intervals_in_words() -> None:
 def test_every_field_is_declared_and_documented() -> None:
     assert set(vars(StudyConfig(tasks=("pusher",)))) == set(OPTIONS)
     assert "stiffness: contact stiffness [N/m] (default: the task's)" in str(StudyConfig.__doc__)
-
-
-def test_a_misspelt_option_of_a_configuration() -> None:
-    with pytest.raises(TypeError, match="^StudyConfig has no option 'estimator'; did you mean estimators?"):
-        StudyConfig(tasks=("pusher",), estimator=("zobg",))  # type: ignore[call-arg]
 
 
 def test_tasks_are_names_or_tasks() -> None:

@@ -1,9 +1,10 @@
 """Process-wide settings."""
 
-import subprocess
 import sys
 
 import pytest
+
+from tests.processes import run_script
 
 ALLOCATES = """
 import resource
@@ -21,5 +22,4 @@ print(faults[2] - faults[1])
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a setting of glibc's")
 def test_memory_that_is_freed_and_needed_again_is_not_cleared_again() -> None:
-    found = subprocess.run([sys.executable, "-c", ALLOCATES], check=True, capture_output=True, text=True)
-    assert int(found.stdout) < 1000, "of 25,600 pages"
+    assert int(run_script(ALLOCATES).stdout) < 1000, "of 25,600 pages"

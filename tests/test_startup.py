@@ -19,8 +19,8 @@ from mjx_study import choices
 from mjx_study.cli import COMMANDS
 from mjx_study.plots.style import STYLES
 from mjx_study.tasks import TASKS
+from tests.processes import ROOT, run_script
 
-ROOT = Path(__file__).resolve().parents[1]
 NAMING_FLAGS = ["gradcheck --help", "rollout --help"]
 """Commands whose help lists the names of MuJoCo's flags."""
 LIGHT = [
@@ -49,9 +49,8 @@ for arguments in sys.argv[1:]:
 
 @pytest.mark.parametrize(("commands", "allowed"), [(LIGHT, set()), (NAMING_FLAGS, {"mujoco", "numpy"})])
 def test_help_lists_and_refusals_import_nothing_that_computes(commands: list[str], allowed: set[str]) -> None:
-    command = [sys.executable, "-c", WATCH, *commands]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
-    loaded = [line.split("|") for line in done.stdout.splitlines() if line.startswith("after ")]
+    printed = run_script(WATCH, *commands).stdout
+    loaded = [line.split("|") for line in printed.splitlines() if line.startswith("after ")]
     assert len(loaded) == len(commands)
     for after, modules in loaded:
         assert HEAVY & set(modules.split()) <= allowed, after

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -34,6 +33,7 @@ from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.dataset import dataset_of
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults
+from tests.documents import study_document
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
@@ -64,24 +64,13 @@ def result(*rows: dict[str, Any], gamma: float | str = 1e8) -> xr.Dataset:
     """A study of those rows, under penalty contact."""
     names = list(dict.fromkeys(each["estimator"] for each in rows))
     stiffnesses = list(dict.fromkeys(each["stiffness"] for each in rows))
-    at = {"task": 0, "timestep": 0, "cone": 0, "sigma": 0, "samples": 0}
-    axes = {"task": ["pusher"], "timestep": [0.01], "cone": ["pyramidal"]}
-    axes |= {"model": [f"penalty {stiffness:g}" for stiffness in stiffnesses], "sigma": [0.1], "samples": [100]}
-    document: dict[str, Any] = {
-        "config": {"kind": "gradients", "tasks": ["pusher"], "estimators": names, "seeds": 1, "iterations": None}
-        | {"confidence": 0.95, "samples": [100], "seed": 0, "reference_samples": 600},
-        "environment": {"precision": "float64"},
-        "warnings": [],
-        "axes": axes,
-        "models": [{"contact": "penalty", "stiffness": stiffness} for stiffness in stiffnesses],
-        "resolved": [{"horizon": [4], "noise": "gaussian", "estimators": {"aobg": {"gamma": gamma}}}],
-        "cells": [
-            {"at": at | {"model": index}} | {key: at[key] for key in ("sigma", "samples")}
-            for index in range(len(stiffnesses))
-        ],
-    }
-    for cell in document["cells"]:
-        cell["at"] = {name: cell["at"][name] for name in axes}
+    document = study_document(len(stiffnesses), estimators=names, tasks=["pusher"], confidence=0.95, samples=[100])
+    document["config"] |= {"seed": 0, "reference_samples": 600}
+    document["environment"] |= {"precision": "float64"}
+    document["axes"] |= {"task": ["pusher"], "timestep": [0.01], "samples": [100]}
+    document["axes"] |= {"model": [f"penalty {stiffness:g}" for stiffness in stiffnesses]}
+    document["models"] = [{"contact": "penalty", "stiffness": stiffness} for stiffness in stiffnesses]
+    document["resolved"][0] |= {"estimators": {"aobg": {"gamma": gamma}}}
     cells = {}
     for index, stiffness in enumerate(stiffnesses):
         here = {each["estimator"]: each for each in rows if each["stiffness"] == stiffness}
@@ -374,14 +363,6 @@ def test_stepwise_estimators_take_a_task_without_controls() -> None:
     found = compare(tasks=("ball_wall",), contact=("reference",), **stepwise).gradient
     np.testing.assert_allclose(found.isel(estimator=0), found.isel(estimator=1), rtol=1e-9)  # longer than the rollout
     assert np.isfinite(found).all()
-
-
-def test_theta_and_sigma_reach_the_plan() -> None:
-    plan = plan_study(config(theta=(0.0, 1.0, 2.0, 3.0), sigma=(0.3,)))
-    assert {cell.sigma for cell in plan.cells} == {0.3} and plan.groups[0].cone == "pyramidal"
-    theta = plan.groups[0].task.theta
-    np.testing.assert_array_equal(theta, np.arange(4))
-    assert theta.dtype == jnp.float64
 
 
 def test_a_task_in_place_of_a_name() -> None:

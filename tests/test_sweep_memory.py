@@ -1,8 +1,5 @@
 """Memory of a sweep: it is bounded, foreseen, and the numbers do not depend on how seeds are grouped."""
 
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,6 +17,7 @@ from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
 from mjx_study.simulation.contact import ContactModel
 from tests.documents import numbers_of
+from tests.processes import run_script
 
 
 class Drawn(MjxObjective):
@@ -116,10 +114,7 @@ def test_memory_does_not_grow(name: str) -> None:
     common, *sizes = GROWING[name]
     peak = []
     for size in sizes:
-        command = [sys.executable, "-c", PEAK, repr(common | size)]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
-        assert done.returncode == 0, done.stderr
-        peak.append(float(done.stdout))
+        peak.append(float(run_script(PEAK, repr(common | size)).stdout))
     planned = plan_study(config(**(common | sizes[name == "samples"] | {"block_size": None}))).memory / 1e9
     assert peak[1] < 1.15 * peak[0] + 0.01, peak
     assert planned / 2 < peak[1] < 2 * planned if name == "seeds" else peak[1] < planned / 4, (peak, planned)

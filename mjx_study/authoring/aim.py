@@ -30,11 +30,9 @@ class Aim:
 
     Attributes:
         body: index of the body whose centre of mass is to move; None for a coordinate of qpos.
-        role: what the body is.
         axis: axis of the world (0 to 2), or index in qpos.
         end: where it ends by itself [m, or unit of qpos]; all three axes for a body.
-        distance: how far the goal is from there along the axis.
-        side: 1 or -1, the direction along the axis.
+        distance, side: how far the goal is from there along the axis, and its direction, 1 or -1.
     """
 
     body: int | None
@@ -46,7 +44,6 @@ class Aim:
 
     @property
     def goal(self) -> tuple[float, ...]:
-        """Three coordinates of a body, or one of qpos."""
         moved = self.axis if self.body is not None else 0
         return tuple(
             rounded(value + self.side * self.distance * (place == moved)) for place, value in enumerate(self.end)
@@ -64,14 +61,8 @@ def rounded(value: float, digits: int = 3) -> float:
 
 
 def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequence[Trial], steps: int) -> Aim | None:
-    """The first of the candidates that noise moves; None if it moves nothing.
-
-    Args:
-        quiet: rollout without noise.
-        noisy: rollouts with the policy's noise.
-        held: rollouts with large constant changes.
-        steps: steps after which the end is measured.
-    """
+    """The first of the candidates that noise moves, by rollouts without noise, with it, and with large constant
+    changes, up to some step; None if it moves nothing."""
     for body, role in _candidates(drive):
         ends, far = (np.array([each.centres[steps, body] for each in trials]) for trials in (noisy, held))
         spread = TYPICAL * np.median(np.abs(far - np.median(far, axis=0)), axis=0)

@@ -38,14 +38,8 @@ RATES: Final = tuple(2.0**power for power in range(-20, 31))
 
 @dataclasses.dataclass(frozen=True)
 class Load:
-    """What a contact carries.
-
-    Attributes:
-        mass: effective mass [kg].
-        speed: approach speed at first touch [m/s].
-        weight: weight of the bodies that move [N].
-        size: least half size of the geoms [m].
-    """
+    """What a contact carries: effective mass [kg], approach speed at first touch [m/s], weight of the bodies that move
+    [N]; and the least half size of the geoms [m]."""
 
     mass: float
     speed: float
@@ -66,12 +60,8 @@ class Proposal:
     """A task for a scene.
 
     Attributes:
-        scene: the scene, without a contact model.
-        drive: what the policy acts by, and the standard deviation of its noise.
-        horizon: number of steps.
-        aim: where a body should end.
-        touches: pairs of geoms in contact in any test rollout, with the earliest touch of each.
-        shares: share of the test rollouts in which each touches.
+        touches, shares: pairs of geoms in contact in any test rollout, with the earliest touch of each, and the share
+            of the test rollouts in which each touches.
         limits: names of joints that reach a limit.
         pair: names of the geoms whose contact is swept; None without one that has names.
         load: what that contact carries; None without one.
@@ -187,7 +177,7 @@ def _touches(trials: Sequence[Trial], steps: int) -> tuple[dict[tuple[int, int],
                 continue
             counts[pair] = counts.get(pair, 0) + 1
             known = found.setdefault(pair, dataclasses.replace(touch))
-            known.depth, known.steps = max(known.depth, touch.depth), max(known.steps, touch.steps)
+            known.depth = max(known.depth, touch.depth)
             if touch.first < known.first:
                 known.first, known.speed = touch.first, touch.speed
     return found, {pair: count / len(trials) for pair, count in counts.items()}

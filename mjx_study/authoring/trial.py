@@ -21,10 +21,8 @@ class Drive:
     """What a policy acts by: controls, or increments of the initial velocity if there are no actuators.
 
     Attributes:
-        host: the compiled model.
-        neutral: controls without a policy, (nu,).
-        scale: standard deviation of the noise, in the unit of what it is added to.
-        meaning: what the scale is, in words.
+        neutral: controls without a policy.
+        scale, meaning: standard deviation of the noise, in the unit of what it is added to, and in words.
     """
 
     host: mujoco.MjModel
@@ -34,42 +32,27 @@ class Drive:
 
     @property
     def size(self) -> int:
-        """Number of entries: controls of a step, or initial velocities."""
         return self.host.nu or self.host.nv
 
     @property
     def at_start(self) -> bool:
-        """Whether it acts on the initial velocity."""
         return self.host.nu == 0
 
 
 @dataclasses.dataclass
 class Touch:
-    """A pair of geoms in contact during a rollout.
-
-    Attributes:
-        first: step of the first touch.
-        speed: approach speed then [m/s].
-        depth: greatest penetration [m].
-        steps: number of steps in contact.
-    """
+    """A pair of geoms in contact during a rollout: step of the first touch, approach speed then [m/s], and greatest
+    penetration [m]."""
 
     first: int
     speed: float
     depth: float = 0.0
-    steps: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """One test rollout.
-
-    Attributes:
-        centres: centres of mass of all bodies after each step [m], (steps + 1, nbody, 3).
-        qpos: positions, (steps + 1, nq).
-        touches: contacts, by pairs of geoms.
-        limits: joints that reached a limit.
-    """
+    """One test rollout: centres of mass of all bodies [m] and positions, the initial ones included; contacts, by pairs
+    of geoms; and joints that reached a limit."""
 
     centres: Float[np.ndarray, "states nbody 3"]
     qpos: Float[np.ndarray, "states nq"]
@@ -123,7 +106,6 @@ def run_trial(drive: Drive, change: Float[np.ndarray, "rows size"], steps: int) 
 def _note(
     host: mujoco.MjModel, data: mujoco.MjData, step: int, touches: dict[tuple[int, int], Touch], limits: set[int]
 ) -> None:
-    """Add the contacts and limits of a step."""
     elliptic, contacts = host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, data.contact
     rows = zip(contacts.geom, contacts.dist, contacts.dim, contacts.efc_address, strict=True)
     for geoms, distance, condim, address in rows:
@@ -133,6 +115,5 @@ def _note(
         first, second = sorted(geoms.tolist())
         touch = touches.setdefault((first, second), Touch(step, approach))
         touch.depth = max(touch.depth, -float(distance))
-        touch.steps += 1
     limited = data.efc_type[: data.nefc] == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
     limits.update(data.efc_id[: data.nefc][limited].tolist())

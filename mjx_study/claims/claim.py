@@ -22,7 +22,7 @@ Range = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Criterion:
-    """Criterion of a claim, fixed before measurement: a statistic, and its values for which claim or opposite hold."""
+    """A statistic, and its values for which a claim or its opposite holds, fixed before measurement."""
 
     quantity: str
     holds: Range
@@ -40,7 +40,6 @@ class Criterion:
         return "fails" if high < self.holds[0] or low > self.holds[1] else "undecided"
 
     def lines(self) -> str:
-        """Describe the ranges."""
         holds = f"holds {_range(self.holds)}"
         return holds if self.reversed is None else f"{holds}, reversed {_range(self.reversed)}"
 
@@ -60,7 +59,6 @@ class Claim:
     """A statement that measurements can refute.
 
     Attributes:
-        id: name on the command line.
         place: section of the paper that states it, or the open question that it answers.
         systems: systems to measure, each with its contact families.
         measure: computes the statistic of the criterion for a system and family, with `options`.
@@ -87,7 +85,6 @@ class Claim:
         return [(system, family) for system, families in self.systems.items() for family in families]
 
     def statistic(self, lab: Laboratory, system: str, family: str) -> Statistic:
-        """Measure one case."""
         return self.measure(lab, system, family, **self.options)
 
     def key(self, effort: Effort) -> str:

@@ -65,9 +65,7 @@ def scaled(dataset: xr.Dataset, variable: str, estimator: str, like: xr.Dataset 
     """Costs of an estimator by seed, scaled to 0 at the start and -1 at the best estimator's mean final cost.
 
     Args:
-        dataset: study of descents.
         variable: "final_cost", or "cost", which is averaged over the iterations.
-        estimator: name of the estimator.
         like: study that sets the scale; None for `dataset`.
     """
     cell, other = (each.isel({name: 0 for name in CELL}) for each in (dataset, dataset if like is None else like))

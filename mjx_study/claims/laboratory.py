@@ -56,7 +56,6 @@ class Effort:
     """Amount of measurement.
 
     Attributes:
-        name: name on the command line.
         density: points of a landscape per standard deviation of the noise.
         draws: number of samples if samples are free.
         batches: number of batches if batches are cheap.
@@ -85,9 +84,7 @@ class Statistic:
     """An estimate with what its interval is computed from.
 
     Attributes:
-        estimate: the value.
-        error: its standard error.
-        freedom: degrees of freedom of the error.
+        error, freedom: its standard error, and the degrees of freedom of that.
         slack: bound on a deterministic error, such as a quadrature's.
         samples, of: number and kind of the samples behind the standard error.
         trials: if not 0, the estimate is a share of this many trials, with a Wilson interval.
@@ -115,7 +112,6 @@ def mean_of(values: Sequence[float] | np.ndarray, of: str, slack: float = 0.0) -
 
 
 def share_of(happened: np.ndarray, of: str) -> Statistic:
-    """Share of independent trials."""
     return Statistic(float(np.mean(happened)), samples=len(happened), of=of, trials=len(happened))
 
 
@@ -263,14 +259,12 @@ def times_of(work: Callable[[], Any]) -> np.ndarray:
 
 
 def closed_form(function: Any, theta: float, sigma: float) -> Slopes:
-    """Gradient and means of an analytic function of one parameter."""
     exactly = smoothed(function, np.array([theta]), sigma)
     gradient, jump = float(exactly.gradient[0]), float(exactly.jump_term[0])
     return Slopes(gradient, gradient - jump, (1e-12, 1e-12), FunctionObjective(function, sigma), theta)
 
 
 def batch(estimator: Estimator, at: Slopes, samples: int) -> GradientEstimate:
-    """Draw a large batch of an estimator."""
     return estimators.estimate(estimator, at.objective, jnp.array([at.theta]), jax.random.key(0), samples)
 
 

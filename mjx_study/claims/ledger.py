@@ -76,8 +76,7 @@ def measure_ledger(
 
     Args:
         effort: key in `EFFORTS`.
-        folder: folder for measurements, one file per claim, and the studies behind them; None to store nothing.
-        progress: called for every case.
+        folder: for measurements, one file per claim, and the studies behind them; None to store nothing.
         verdicts: number of verdicts in the whole ledger, which sets the level of the intervals.
         command: command line to record.
         accept_versions: reuse measurements and resume studies made by other code or versions.

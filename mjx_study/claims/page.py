@@ -33,7 +33,6 @@ def run_summary(document: dict[str, Any]) -> str:
 
 
 def verdict_counts(document: dict[str, Any]) -> str:
-    """Count the verdicts of each kind."""
     found = Counter(each["verdict"] for claim in document["claims"] for each in claim["evidence"])
     listed = ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS if found[verdict])
     without = document.get("not_checked", 0)
@@ -42,9 +41,10 @@ def verdict_counts(document: dict[str, Any]) -> str:
 
 
 def matrix_lines(document: dict[str, Any]) -> list[str]:
-    """Format the matrix for a terminal."""
-    header, *rows = cells(document)
-    return format_table(rows, header)
+    """Format the matrix for a terminal: a row of families, then one for each claim."""
+    rows, shown = matrix(document)
+    summary = [[name, *(_summary(row.get(family, [])) for family in shown)] for name, row in rows.items()]
+    return format_table(summary, ["", *shown])
 
 
 def matrix(document: dict[str, Any]) -> tuple[dict[str, dict[str, list[str]]], list[str]]:
@@ -55,13 +55,6 @@ def matrix(document: dict[str, Any]) -> tuple[dict[str, dict[str, list[str]]], l
         for each in claim["evidence"]:
             row.setdefault(each["family"], []).append(each["verdict"])
     return rows, [family for family in FAMILIES if any(family in row for row in rows.values())]
-
-
-def cells(document: dict[str, Any]) -> list[list[str]]:
-    """Matrix as text: a row of families, then one for each claim."""
-    rows, shown = matrix(document)
-    summary = [[name, *(_summary(row.get(family, [])) for family in shown)] for name, row in rows.items()]
-    return [["", *shown], *summary]
 
 
 def _summary(verdicts: list[str]) -> str:

@@ -18,7 +18,7 @@ from typing import Final
 from mjx_study.cli.options import refuse_unusable
 from mjx_study.cli.output import OutputError, complain, encodable, ending, written_out
 from mjx_study.options.parser import Parser, UsageError
-from mjx_study.version import summary, version_of
+from mjx_study.version import version_of
 
 ENDED = "existing files are complete"
 EXAMPLES = """\
@@ -54,7 +54,6 @@ ALIASES: Final = {"optimize": "optimise"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
     # Suppress XLA's banners about programs that take minutes to compile; failures still raise.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
@@ -82,7 +81,8 @@ def parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """Build the command line's parser, with the options of all commands or of one only."""
     root = Parser(
         prog="mjx-study",
-        description=f"{summary()}.",
+        description="Measure, with real contact physics, whether the gradients of a differentiable simulator are worth "
+        "having.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -21,11 +21,12 @@ def add(command: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from mjx_study.bench import plan_bench, run_bench
+    from mjx_study.bench import check_bench, run_bench
 
     with usage_errors():
         configure_process(options)
-        plan = plan_bench(task_of(options), options.samples)
+        task = task_of(options)
+        check_bench(task, options.samples)
     with computing() as progress:
-        report = run_bench(plan, progress)
+        report = run_bench(task, options.samples, progress)
     return print_report(options, report.as_json(), report.lines())

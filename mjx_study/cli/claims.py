@@ -39,7 +39,6 @@ def add(command: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure the claims and print their verdicts."""
     from mjx_study.claims import CLAIMS, NUM_VERDICTS
     from mjx_study.claims.ledger import measure_ledger
     from mjx_study.claims.page import draw_matrix, markdown, matrix_lines, run_summary, undecided, verdict_counts

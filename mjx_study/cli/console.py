@@ -45,7 +45,6 @@ MOST_SHOWN: Final = 3
 
 
 def _debiased(row: Row, name: str) -> str:
-    """Format a value and what remains of it without noise."""
     value, debiased, error = (getattr(row, each) for each in (name, DEBIASED[name], f"{DEBIASED[name]}_se"))
     left, doubt = remains(name, value, debiased, error), _doubt(row)
     return f"{GRADIENTS[name].text(value)} -> {left.removesuffix('-') if doubt else left}{doubt}"
@@ -117,7 +116,6 @@ def _chosen(config: dict[str, Any]) -> str:
 
 
 def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool = False) -> list[str]:
-    """Format a study of gradients and its document: configuration, a table per contact family, findings."""
     config, rows, lines = document["config"], rows_of(dataset), []
     shown = columns(config["confidence"], onset_of(dataset), details=details, scalar=dataset.sizes.get("param") == 1)
     for resolved, task in zip(document["resolved"], dataset["task"].values.tolist(), strict=True):
@@ -160,12 +158,10 @@ def _range(values: Any, show: Callable[[float], str]) -> str:
 
 
 def rows_as_json(dataset: xr.Dataset) -> dict[str, Any]:
-    """Findings, and a row per estimate."""
     return {"findings": findings_of(dataset), "rows": [row.as_dict() for row in rows_of(dataset)]}
 
 
 def curves(dataset: xr.Dataset) -> dict[str, Any]:
-    """Findings, and a curve per contact model."""
     found = [
         {"label": label, "contact": one["contact"].item(), "stiffness": one["stiffness"].item() or None}
         | {str(name): one[name].values for name in one if "entry" not in str(one[name].dims)}
@@ -192,7 +188,6 @@ def curve_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
 
 
 def descents(dataset: xr.Dataset) -> dict[str, Any]:
-    """Descents of every estimator, with histories by iteration and seed."""
     config, resolved = json.loads(dataset.attrs["config"]), json.loads(dataset.attrs["resolved"])[0]
     one = dataset.isel({name: 0 for name in ("task", "timestep", "cone", "model", "sigma", "samples")})
     place = {name: one[name].item() for name in ("contact", "stiffness", "cone", "sigma", "samples")}
@@ -235,13 +230,14 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         where = f"{where}, K = {config['stiffness']:g} N/m"
     metrics = "".join(f", {name} {number(value, 3)}" for name, value in document["start_metrics"].items())
     decay = f" / i^{config['decay']:g}" if config["decay"] else ""
+    seeds = f"seed {config['seed']}" if config["seeds"] == 1 else f"{config['seeds']} seeds from {config['seed']}"
     start, (mean, error) = DESCENTS["start_cost"], document["start_cost"]
     shown = [(DESCENTS | DERIVED)[name].heading for name in DESCENT_COLUMNS]
     headings = ["estimator", *shown[:2], *document["start_metrics"], *shown[2:]]
     lines = [
         f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
         f"{config['iterations']} iterations",
-        f"{config['samples']} samples in each batch, {_seeds(config)}, "
+        f"{config['samples']} samples in each batch, {seeds}, "
         f"sigma {config['sigma']:g}; {start.heading} {with_error(mean, error, start.digits)}{metrics}",
         "",
         *format_table([_row(run, onset) for run in document["runs"]], headings),
@@ -251,10 +247,6 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
             label = label_of(run["estimator"], onset)
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
     return lines + [f"{sentence}." for sentence in document["findings"]]
-
-
-def _seeds(config: dict[str, Any]) -> str:
-    return f"seed {config['seed']}" if config["seeds"] == 1 else f"{config['seeds']} seeds from {config['seed']}"
 
 
 def _row(run: dict[str, Any], onset: str) -> list[str]:
@@ -277,7 +269,6 @@ def _finite(values: list[float | None]) -> np.ndarray:
 
 
 def _with_spread(of: Callable[[np.ndarray], float], values: np.ndarray, digits: int) -> str:
-    """Format a statistic of values with their standard deviation."""
     if len(values) == 0:
         return "nan"
     return with_error(float(of(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None, digits)

@@ -32,7 +32,6 @@ def add(command: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure and print; return 1 if a derivative is wrong."""
     from mjx_study.diagnose.page import document_of, page_lines
     from mjx_study.diagnose.run import diagnose_task
     from mjx_study.tasks.contact_grid import single_contact

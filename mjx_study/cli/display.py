@@ -71,7 +71,6 @@ class Activity:
 
     @contextmanager
     def listening(self) -> Generator[None]:
-        """Listen to JAX."""
         from jax import monitoring
 
         monitoring.register_scalar_listener(self.began)
@@ -85,15 +84,7 @@ class Activity:
 
 
 class Display:
-    """Progress whose counters never run backwards, with a sign of life after each silence.
-
-    Args:
-        show: shows progress.
-        activity: what is built.
-        clock: the time [s].
-        within: shortest time between calls of `show` for one stage [s].
-        silence: time without a call of `show` before a sign of life [s].
-    """
+    """Progress whose counters never run backwards, with a sign of life after each silence; see `WITHIN`, `SILENCE`."""
 
     def __init__(
         self,
@@ -147,7 +138,6 @@ class Display:
 
 @contextmanager
 def ticking(tick: Callable[[], None], seconds: float = TICK) -> Generator[None]:
-    """Call a function at intervals, in a thread."""
     ended = threading.Event()
 
     def look() -> None:

@@ -82,7 +82,6 @@ def add(command: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check and print; return 1 if something is wrong, 3 if something was not exercised."""
     from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 
     given = [name for name in (*MEAN_OPTIONS, *DERIVATIVES) if getattr(options, name) not in (None, False)]

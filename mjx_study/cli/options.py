@@ -47,7 +47,6 @@ def given_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def study_fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Fields of a `StudyConfig` set by the options."""
     fields = given_options(options, *OPTIONS)
     if "theta" in fields:
         fields["theta"], _ = theta_and_policy(options)

@@ -123,7 +123,6 @@ def shown_progress() -> Generator[Progress]:
 
 @contextmanager
 def _bar(activity: Activity) -> Generator[Show]:
-    """A bar on the terminal, with what is built at the moment."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -138,7 +137,6 @@ def _bar(activity: Activity) -> Generator[Show]:
 
 
 def _lines() -> Show:
-    """A line for each stage, and for each sign of life."""
     begun = time.monotonic()
 
     def show(done: int, total: int, what: str, life: str) -> None:

@@ -67,7 +67,10 @@ def run_one(
         for write in (lambda: also(document, folder), lambda: save_figures(plot_study(dataset), folder)):
             paths, failure = attempt(write)
             written, failures = written + paths, [*failures, failure]
-    checks = _checked(plan, thetas(document)) if thetas else []
+    checks: list[MeanCheck] = []
+    if thetas:
+        with computing() as progress:
+            checks = check_terms(plan, thetas(document), progress)
     document |= {"means": [each.as_dict() for each in checks]} if checks else {}
     about = term_lines(checks, plan.config.onset)
     lines = [*lines_of(dataset, document), *about, *(f"warning: {message}" for message in document["warnings"])]
@@ -77,11 +80,6 @@ def run_one(
     if folder is not None and not unwritten:
         lines.append(f"written to {folder}: {', '.join([*(path.name for path in written), KEPT])}")
     return print_report(options, document, lines, *failures, all_lost(plan, dataset))
-
-
-def _checked(plan: StudyPlan, thetas: Mapping[str, Any]) -> list[MeanCheck]:
-    with computing() as progress:
-        return check_terms(plan, thetas, progress)
 
 
 def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
@@ -115,7 +113,6 @@ def _compute_in(store: Store, plan: StudyPlan, options: argparse.Namespace, *, k
 
 
 def _announce(plan: StudyPlan, options: argparse.Namespace) -> int:
-    """Print the forecast cost of a study."""
     with usage_errors():
         found = forecast_study(plan, options.output, accept_versions=options.accept_versions)
     lines = [*found.lines, *(f"warning: {message}" for message in plan.warnings)]

@@ -41,7 +41,11 @@ A TOML file holds the same options under the names of their flags, with _ for -:
 
 def add(command: Parser) -> None:
     choices = f"one or more of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
-    command.add_argument("tasks", nargs="?", type=_tasks, metavar="TASK[,TASK]", help=choices)
+
+    def tasks(text: str) -> tuple[str, ...]:
+        return tuple(map(known_task, OPTIONS["tasks"].parse(text)))
+
+    command.add_argument("tasks", nargs="?", type=tasks, metavar="TASK[,TASK]", help=choices)
     command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags take precedence")
     command.add_options(
         "contact", "stiffness", "damping", "smoothing", "solref", "solimp", "timestep", "cone", "sigma", "samples"
@@ -88,7 +92,3 @@ def sweep_fields(options: argparse.Namespace) -> dict[str, Any]:
     if fields.get("solref") or fields.get("solimp"):
         fields.setdefault("contact", ())
     return fields
-
-
-def _tasks(text: str) -> tuple[str, ...]:
-    return tuple(map(known_task, OPTIONS["tasks"].parse(text)))

@@ -16,7 +16,6 @@ def add(command: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """List the tasks; only the numbers in --json need their models."""
     lines = [f"{name:<25} {description}" for name, description in TASK_DESCRIPTIONS.items()]
     return print_report(options, {"tasks": _rows(options)} if options.json else {}, lines)
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from mjx_study.diagnose.measurement import SAMPLES, TARGET_ERROR
-from mjx_study.diagnose.result import Diagnosis, round_up
+from mjx_study.diagnose.run import Diagnosis, round_up
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
 from mjx_study.table import percent
 

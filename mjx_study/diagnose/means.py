@@ -45,13 +45,9 @@ MIN_SHARE: Final = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class MeanCheck:
-    """Check of one estimator for one contact model; made by `check_mean`.
+    """Check of one estimator's mean for one contact model; made by `check_mean`.
 
-    Attributes:
-        contact, stiffness: contact model and its stiffness [N/m], 0 if not defined by one.
-        estimator: name of the estimator whose mean is checked.
-        circulation: integral of its mean, compared with the difference of the cost.
-        verdict: "right" within `estimators.mean_check.TOLERANCE`, "biased", or "undecided".
+    The stiffness [N/m] is 0 for a contact model not defined by one; the verdict is "right", "biased" or "undecided".
     """
 
     contact: str
@@ -145,16 +141,13 @@ def check_mean(
 
     Args:
         task: task with the theta that the path passes through, and its onset treatment.
-        cells: contact models to check the estimators for.
         estimators: estimators with their options; they share the samples.
         samples: samples at each node of the path.
-        seed: random seed of the samples and of a random direction.
         names: names of the estimators in the checks; by default their own.
         span: ends of the path, from theta along the direction [unit of theta]; None for two standard deviations of the
             noise to either side, or 0.02 for noise on the controls.
         direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
         tolerance: share of the cost's difference within which a mean is right.
-        progress: called with (contact models done, their total number, label of the next).
 
     Raises:
         ValueError: an estimator's formula does not apply to the task, or the direction is invalid.
@@ -200,7 +193,6 @@ def check_terms(
 
     Args:
         thetas: parameters at which to check, by estimator; by default the task's.
-        progress: called with (checks done, their total number, label of the next) if there are any.
     """
     objectives, found = Objectives(plan), []
     chosen = [
@@ -225,7 +217,6 @@ def check_terms(
 
 
 def term_lines(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
-    """Say of every check what it found."""
     lines = []
     for check in checks:
         row, name = check.as_dict(), label_of(check.estimator, onset)
@@ -240,7 +231,6 @@ def term_lines(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
 
 
 def lines_of(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
-    """Format the checks as a table."""
     identity = (
         Column("contact", itemgetter("contact")),
         Column("K [N/m]", lambda row: f"{row['stiffness']:g}" if row["stiffness"] else "-"),

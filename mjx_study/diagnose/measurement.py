@@ -83,12 +83,11 @@ class Measured:
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """Measurements of the estimators under one contact model.
+    """Measurements of the estimators under one contact model, best first.
 
     Attributes:
         onsets: `mjx_study.results.variables.ONSETS` of the first-order batch.
         unconverged: number of rollouts in which the solver did not converge.
-        estimators: the estimators, best first.
     """
 
     samples: int
@@ -98,7 +97,6 @@ class Measurement:
 
     @property
     def lost(self) -> int:
-        """Largest number of nonfinite samples of any estimator."""
         return max(each.lost for each in self.estimators)
 
     @property
@@ -113,17 +111,14 @@ class Measurement:
 
     @property
     def norm_error(self) -> float:
-        """Standard error of the norm of the gradient."""
         return math.sqrt(self.surest.variance / self.samples)
 
     @property
     def resolved(self) -> bool:
-        """Whether the gradient is distinguishable from 0."""
         return self.surest.norm > RESOLVED_SE * self.norm_error
 
     @property
     def best(self) -> Measured:
-        """The estimator with the least error after a second of computing."""
         return self.estimators[0]
 
     @property
@@ -146,13 +141,10 @@ def chunk_of(task: Task, samples: int) -> int:
 
 
 def affordable(seconds: float, chunk: int) -> int:
-    """Number of samples that fit into `BUDGET_SECONDS`, at theta and along all paths, but at least one call per path.
+    """Number of samples that fit into `BUDGET_SECONDS`, at theta and along all paths, but at least one call per path,
+    given the time of one call of all programs [s] and its number of samples, including a baseline.
 
     The number of calls is the nearest power of two, so that the next run mostly has as many and draws the same numbers.
-
-    Args:
-        seconds: time of one call of all programs [s].
-        chunk: number of samples in it, including a baseline.
     """
     calls = max(1.0, BUDGET_SECONDS / (seconds * MAX_PATHS * (NODES + 1)))
     return min(SAMPLES, MAX_PATHS * chunk * 2 ** round(math.log2(calls)) - 1)
@@ -167,12 +159,7 @@ def measure(
 ) -> Measurement:
     """Measure the estimators at the task's theta, without the contacts and step derivatives of a diagnosis.
 
-    Args:
-        simulator: its compiled programs serve every contact model.
-        contact: the contact model; None for the MJCF's.
-        samples: see `diagnose_task`.
-        seed: random seed.
-        progress: called before each part.
+    The simulator's compiled programs serve every contact model, None being the MJCF's; samples as in `diagnose_task`.
     """
     task = simulator.task
     chosen = estimators_of(task)

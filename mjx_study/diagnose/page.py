@@ -11,7 +11,7 @@ from mjx_study.diagnose.advice import advise, cautions
 from mjx_study.diagnose.columns import CONTACTS, ESTIMATES
 from mjx_study.diagnose.means import ALONG_MEANS
 from mjx_study.diagnose.measurement import RESOLVED_SE, Measured
-from mjx_study.diagnose.result import Diagnosis, round_up
+from mjx_study.diagnose.run import Diagnosis, round_up
 from mjx_study.gradcheck.diagnosis import MEANING
 from mjx_study.runtime import environment
 from mjx_study.table import Column, as_plain, percent, tabulate, with_error
@@ -129,7 +129,7 @@ def _estimator_lines(found: Diagnosis) -> list[str]:
 
 
 def _estimate(found: Diagnosis, each: Measured) -> tuple[str, str, str, str]:
-    """Error, its interval, verdict on the mean, and milliseconds of an estimator."""
+    """Error, its interval, verdict on the mean, and milliseconds."""
     error, low, high = (each.error(found.scale, end) for end in (None, each.lower, each.upper))
     uncertainty = math.hypot((high - low) / 4 / error, found.scale_error) if error else 0.0
     shown, least, most = (found.error_text(value, uncertainty) for value in (error, low, high))

@@ -1,14 +1,14 @@
-"""Run all measurements of a diagnosis, in order."""
+"""Run all measurements of a diagnosis, in order; its errors as text."""
 
 import dataclasses
+import math
 from typing import Final
 
 from mjx_study.choices import is_file, takes_stiffness
-from mjx_study.diagnose.measurement import SAMPLES, chunk_of, estimators_of, measure
-from mjx_study.diagnose.result import Diagnosis
-from mjx_study.diagnose.setting import setting_of, touches_of
+from mjx_study.diagnose.measurement import SAMPLES, Measured, Measurement, chunk_of, estimators_of, measure
+from mjx_study.diagnose.setting import ContactSummary, RolloutSetting, setting_of, touches_of
 from mjx_study.experiment.memory import check_memory
-from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
+from mjx_study.gradcheck import GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
 from mjx_study.options.option import OptionError
 from mjx_study.progress import Progress, silent
@@ -21,6 +21,59 @@ STATES: Final = 2
 """Number of states in the gradient check."""
 PARTS: Final = ("rollout without noise", "derivatives of steps", "estimators")
 """Names of the parts in progress."""
+ONE_DIGIT_UNCERTAINTY: Final = 0.5
+"""Relative standard error beyond which an error is shown with one digit."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis(Measurement):
+    """Everything measured; `page` formats it.
+
+    Attributes:
+        subject: the model as named by the user.
+        contact, warnings: label of the contact model, and warnings about it.
+        touches: contacts that begin in the zero-noise rollout.
+        options: contact options as command-line flags.
+    """
+
+    subject: str
+    task: Task
+    setting: RolloutSetting
+    contact: str
+    touches: tuple[ContactSummary, ...]
+    derivatives: GradcheckReport
+    warnings: tuple[str, ...]
+    options: str
+
+    @property
+    def failure(self) -> str:
+        return next((finding.verdict for finding in self.derivatives.findings if finding.fails), "wrong")
+
+    @property
+    def scale(self) -> float:
+        """Norm that errors are relative to: the gradient's if it is distinguishable from 0, else 1."""
+        return self.norm if self.resolved else 1.0
+
+    @property
+    def scale_error(self) -> float:
+        return self.norm_error / self.norm if self.resolved else 0.0
+
+    def error_text(self, error: float, uncertainty: float) -> str:
+        """Format an error to two significant digits, or to one if its relative standard error is large."""
+        digits = 1 if uncertainty > ONE_DIGIT_UNCERTAINTY else 2
+        size = float(f"{error * (100 if self.resolved else 1):.{digits}g}")
+        decimals = digits - 1 - math.floor(math.log10(size)) if size > 0 else 0
+        text = f"{size:.{max(decimals, 0)}f}" if -6 < decimals < 6 else f"{size:g}"
+        return f"{text}{' %' if self.resolved else ''}"
+
+    def bias_text(self, estimator: Measured) -> str:
+        return self.error_text(estimator.bias / self.scale, math.hypot(estimator.bias_error, self.scale_error))
+
+
+def round_up(number: float) -> str:
+    """Round up to two significant digits, with thousands separators."""
+    digits = max(0, math.floor(math.log10(max(number, 1.0))) - 1)
+    return f"{math.ceil(number / 10**digits) * 10**digits:,}"
 
 
 def diagnose_task(
@@ -39,13 +92,10 @@ def diagnose_task(
 
     Args:
         subject: the model as named by the user; for a file, the gradient check covers single steps only.
-        family: contact family; None for the task's main one.
-        stiffness: contact stiffness [N/m]; None for the task's middle one.
-        damping: contact damping [N s/m]; None for the family's.
+        family, stiffness, damping: of the contact [N/m, N s/m]; None for those of a single run.
         samples: samples per batch, and per node of the paths along which means are checked; None for `SAMPLES`, or as
             many as fit into `BUDGET_SECONDS`.
         options: contact options as command-line flags.
-        progress: called before each part.
 
     Raises:
         ValueError: there is no such contact model, or the batches do not fit in memory.

@@ -12,6 +12,7 @@ import numpy as np
 from mjx_study.choices import is_file
 from mjx_study.objective import compiled_rollout
 from mjx_study.simulation.contact import stable, stiffness_from_solref
+from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
@@ -21,15 +22,8 @@ _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HIN
 
 @dataclasses.dataclass(frozen=True)
 class RolloutSetting:
-    """The setting for which a diagnosis holds.
-
-    Attributes:
-        noise: name of the noise density.
-        sigma: standard deviation of the noise, in `sigma_unit`, which is empty if it is not known.
-        timestep: timestep [s].
-        horizon: number of steps.
-        params: number of parameters.
-    """
+    """The setting for which a diagnosis holds, with the timestep in seconds; `sigma_unit` is empty if it is not
+    known."""
 
     noise: str
     sigma: float
@@ -126,7 +120,7 @@ def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: floa
     rows = data.efc_vel[first : first + (edges if pyramid else 1)]
     speed = -float(np.mean(rows)) if first >= 0 else 0.0
     return ContactSummary(
-        pair=" and ".join(host.geom(geom).name or f"geom {geom}" for geom in contact.geom),
+        pair=" and ".join(geom_label(host, int(geom)) for geom in contact.geom),
         time=time,
         speed=speed,
         damping=timestep * b,

@@ -30,7 +30,6 @@ class Cells:
         return work.missing
 
     def compute(self, index: int, unit: int) -> Future[Arrays]:
-        """Compute a unit in this process."""
         return self.computation.compute(self.plan.cells[index], unit, self._works[index][0])
 
     def kept(self, index: int) -> Arrays:
@@ -72,7 +71,6 @@ class Cells:
         self._compiled.add(program)
 
     def report(self, what: str) -> None:
-        """Report progress in whole cells."""
         self._progress(self.done, len(self.plan.cells), what)
 
     def _checkpoint(self, index: int) -> Checkpoint:

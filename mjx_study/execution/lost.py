@@ -31,8 +31,9 @@ def all_lost(plan: StudyPlan, dataset: xr.Dataset) -> str | None:
 def first_nonfinite(task: Task, states: State, controls: jax.Array, contact: ContactModel | None = None) -> str:
     """Name the step, the joint or cost, and the quantity that is the first not to be finite in a rollout."""
     host, kinds = task.scene.host, mujoco.mjtObj
+    joints_of_qpos = np.repeat(np.arange(host.njnt), np.diff([*host.jnt_qposadr, host.nq]))
     for step in range(task.horizon + 1):
-        for quantity, owners in (("qvel", host.dof_jntid), ("qpos", _joints_of_positions(host)), ("act", None)):
+        for quantity, owners in (("qvel", host.dof_jntid), ("qpos", joints_of_qpos), ("act", None)):
             wrong = np.flatnonzero(~np.isfinite(np.asarray(getattr(states, quantity)[step])))
             if not len(wrong):
                 continue
@@ -51,8 +52,3 @@ def first_nonfinite(task: Task, states: State, controls: jax.Array, contact: Con
     if not np.isfinite(final := float(final_cost(last_of(states)))):
         return f"the final_cost is {final} after step {task.horizon}, where the state is finite"
     return "the costs are finite, their derivatives are not; mjx-study gradcheck finds the step"
-
-
-def _joints_of_positions(host: mujoco.MjModel) -> np.ndarray:
-    """Joint of each entry of qpos."""
-    return np.repeat(np.arange(host.njnt), np.diff([*host.jnt_qposadr, host.nq]))

@@ -81,7 +81,6 @@ def run_study(
 
 
 def _in_memory(plan: StudyPlan, progress: Progress, command: str | None) -> xr.Dataset:
-    """Compute all cells and write none."""
     document, total = as_plain(document_of(plan, command)), len(plan.cells)
     document["config"]["chunk_size"] = plan.chunk_size
     computed = compute_here(Cells(plan, plan.kind.computation(plan), progress), range(total))
@@ -99,26 +98,24 @@ def _in_folder(
         store.read(index) if store.has(index) else store.read_part(index)
     cells = Cells(plan, plan.kind.computation(plan), progress, store)
     held: dict[int, tuple[Arrays, dict[str, str]]] = {}
-    failed, computed = set[int](), 0
+    failed: dict[int, str] = {}
+    computed = 0
     unwritten: OSError | None = None
     while missing := [index for index in store.missing if index not in held and index not in failed]:
         cells.done, claimed = total - len(missing), False
         for index, arrays in _claimed(store, missing, cells, executor):
             claimed = True
+            if isinstance(arrays, str):
+                failed[index] = arrays
+                continue
+            computed += 1
             try:
-                if isinstance(arrays, str):
-                    failed.add(index)
-                    store.write_failure(index, arrays)
-                    continue
-                computed += 1
                 store.record(plan.seen)
                 store.write(index, arrays)
             except OSError as error:
                 if not keep_going:
                     raise
-                unwritten = error
-                if not isinstance(arrays, str):
-                    held[index] = (arrays, store.document["versions"])
+                unwritten, held[index] = error, (arrays, store.document["versions"])
         if not claimed:
             progress(cells.done, total, "another process computes the rest")
             time.sleep(WAIT_SECONDS)
@@ -134,8 +131,8 @@ def _in_folder(
         dataset.attrs["other_versions"] = different
     if unwritten is not None:
         dataset.attrs["unwritten"] = f"cannot write to {store.folder}: {unwritten.strerror or unwritten}"
-    if failures := store.failures:
-        dataset.attrs["failed_cells"] = json.dumps({cells.label(index): why for index, why in failures.items()})
+    if failed:
+        dataset.attrs["failed_cells"] = json.dumps({cells.label(index): why for index, why in failed.items()})
     return dataset.assign_attrs(computed_cells=computed)
 
 

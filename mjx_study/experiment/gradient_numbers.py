@@ -27,13 +27,8 @@ def cell_numbers(
     tallies: Sequence[dict[str, Tally]],
     samples: int,
 ) -> dict[str, np.ndarray]:
-    """Assemble a cell's numbers.
-
-    Args:
-        numbers: what `estimate_numbers` returns, with a leading axis of seeds.
-        tallies: diagnostics of each seed's or group of seeds' batches, by oracle.
-        samples: number of samples of all seeds.
-    """
+    """Assemble a cell's numbers from those of `estimate_numbers`, with a leading axis of seeds, the diagnostics of each
+    seed's or group of seeds' batches, by oracle, and the number of samples of all seeds."""
     arrays = _of_seeds(numbers) | _bias(numbers, reference) | _of_batches(chosen, tallies, samples)
     if arrays["gradient"].size > MOST_KEPT:
         del arrays["gradient"]
@@ -73,7 +68,6 @@ def padded(leaf: Any, size: int) -> Any:
 
 @partial(jax.jit, static_argnames="chosen")
 def samples_of_parts(batches: Batches, chosen: tuple[Estimator, ...]) -> list[list[Array]]:
-    """Samples of each estimator's parts."""
     return [[part.per_sample for part in each.parts(*each.pick(batches))] for each in chosen]
 
 

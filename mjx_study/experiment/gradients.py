@@ -216,14 +216,12 @@ class GradientComputation(Computation):
         return done(self._reference_unit(cell) if unit == REFERENCE_UNIT else self._block(cell, unit))
 
     def _reference_unit(self, cell: StudyCell) -> Arrays:
-        """Samples of the reference."""
         objective = self._objective(cell)
         keys = sample_keys(self._keys["order"][0][0], 0, min(cell.samples, PILOT))
         pilot = objective.evaluate(self._plan.task_of(cell).theta, keys)
         return {"reference": np.asarray(self._reference(cell, objective, pilot)[0].per_sample)}
 
     def _block(self, cell: StudyCell, unit: int) -> Arrays:
-        """Summary of a block."""
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
         chosen, size = estimators_of(self._plan, cell), block_of(self._plan, cell)
         seed, index = Blocks.position(unit, blocks_of(self._plan, cell))
@@ -260,7 +258,6 @@ class GradientComputation(Computation):
         return found | {"reference_pairs": np.array(float(self._config.settings.reference_samples))}
 
     def _whole(self, cell: StudyCell) -> Future[Arrays]:
-        """A cell's numbers from whole batches."""
         config, oracles, keys = self._config, self._plan.oracles, self._keys
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
         tests, chosen = keys["tests"], estimators_of(self._plan, cell)

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from typing import Final
 
-import jax
-
 from estimators import ESTIMATORS, Estimator, oracles_of
 from estimators.merged_samples import EXTREMES
 from mjx_study.limits import MOST_GIB
@@ -25,11 +23,6 @@ BLOCK_BYTES: Final = 512e6
 block."""
 
 
-def largest_batch() -> int:
-    """Maximum number of samples drawn at once by JAX's default backend."""
-    return LARGEST_BATCH[jax.default_backend()]
-
-
 def padded_size(samples: int) -> int:
     """Smallest size in `PADDED` that holds a batch, or its own."""
     return next((size for size in PADDED if size >= samples), samples)
@@ -38,11 +31,6 @@ def padded_size(samples: int) -> int:
 def padded_seeds(seeds: int) -> int:
     """Smallest power of 16 that holds as many seeds: so many have keys."""
     return next(size for size in (16**power for power in range(1, 9)) if size >= seeds)
-
-
-def batches_at_once(samples: int) -> int:
-    """Number of batches of this many samples that are drawn at once."""
-    return max(1, largest_batch() // samples)
 
 
 def numbers_per_sample(task: Task, oracle: str) -> int:

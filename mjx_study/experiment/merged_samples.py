@@ -37,12 +37,7 @@ class Blocks(Work):
         kept: Mapping[str, np.ndarray],
         merge: Callable[["Blocks"], Arrays] = lambda blocks: {},
     ):
-        """
-        Args:
-            blocks: number of blocks per seed.
-            kept: arrays of a checkpoint, as returned by `arrays`.
-            merge: computes the cell's numbers once all blocks are finished.
-        """
+        """Take so many blocks per seed, those of a checkpoint (see `arrays`), and what computes the cell's numbers."""
         self.seeds, self.blocks, self._merge = seeds, blocks, merge
         self.units = 1 + seeds * blocks
         self.reference = kept.get("reference")

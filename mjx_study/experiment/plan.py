@@ -10,7 +10,7 @@ import jax
 from estimators.interpolation import check_weights
 from estimators.noise import check_sigma
 from mjx_study.choices import CONES, REFERENCE
-from mjx_study.experiment.memory import largest_batch
+from mjx_study.experiment.memory import LARGEST_BATCH
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.experiment.study import Group, StudyCell, StudyKind, StudyPlan, estimators_of
 from mjx_study.experiment.unused_options import reject_unused_options
@@ -80,7 +80,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
         groups.append(group)
     most = max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * kind.batches_at_once(config)
     tasks = [group.task for group in groups]
-    most = min(largest_batch(), most)
+    most = min(LARGEST_BATCH[jax.default_backend()], most)
     size = config.chunk_size or chunk_for(most, local_devices(), tasks, own_program=kind.one_program)
     plan = StudyPlan(config, tuple(groups), tuple(cells), size, tuple(dict.fromkeys(messages)))
     kind.check_memory(plan)

@@ -88,12 +88,8 @@ def reference_of(
 ) -> GradientEstimate:
     """Return the reference gradient of a contact model, independent of which others are compared.
 
-    Args:
-        objective: the task under that contact model, or its analytic system.
-        odd_keys: keys of the rollout pairs.
-        candidate_keys: keys of the first-order samples whose median is a candidate for the control variate.
-        pilot: a batch from other keys, used to select among the candidates.
-        soft: another candidate, see `soft_gradient`.
+    `candidate_keys` are those of first-order samples, whose median is a candidate for the control variate beside
+    `soft`, see `soft_gradient`; the pilot batch, which selects among them, has other keys.
     """
     if not isinstance(objective, MjxObjective) or not takes_candidates(task):
         plus, minus = objective.evaluate_pair(task.theta, odd_keys)
@@ -111,15 +107,10 @@ def most_parts(task: Task, pairs: int) -> int:
 
 
 def averaged(draw_part: Callable[[int], GradientEstimate], most: int) -> tuple[GradientEstimate, int]:
-    """Average independent references until the uncertainty is at most `TARGET`, or all are used.
+    """Average independent references, drawn by index, until the uncertainty is at most `TARGET` or all are used.
 
-    Args:
-        draw_part: returns a reference by index.
-        most: number of references that there are.
-
-    Returns:
-        The reference, whose rows are means over rows of its parts, so that compiled statistics serve any number; and
-        the number of parts.
+    Returns the reference, whose rows are means over rows of its parts, so that compiled statistics serve any number,
+    and the number of parts.
     """
     estimate = draw_part(0)
     rows = np.asarray(estimate.per_sample)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from estimators import ORACLES, Linearisation
-from mjx_study.experiment.memory import PADDED, batches_at_once, padded_seeds, padded_size
+from mjx_study.experiment.memory import LARGEST_BATCH, PADDED, padded_seeds, padded_size
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
@@ -61,7 +61,6 @@ def rows_of_keys(keys: Key[Array, "*rows"], rows: Any) -> Any:
 
 
 def _wrapped(data: Any) -> Any:
-    """Keys of data on the host."""
     return jax.random.wrap_key_data(data)
 
 
@@ -103,7 +102,7 @@ def draw_batches(
     Returns:
         By oracle: the batch, on CPUs as NumPy arrays; its computing time [s]; and each rollout's solver residual.
     """
-    together, on_host = batches_at_once(samples), jax.default_backend() == "cpu"
+    together, on_host = max(1, LARGEST_BATCH[jax.default_backend()] // samples), jax.default_backend() == "cpu"
     drawn, seconds, residuals = {}, {}, {}
     for name in oracles:
         streams: Key[Array, " seeds"] = rows_of_keys(keys["order"][ORACLES[name].order], seeds)

@@ -25,10 +25,9 @@ from mjx_study.identity import contents, estimator_contents
 from mjx_study.options.configuration import Settings, StudyConfig
 from mjx_study.results.kind import StudyResults, find_kind
 from mjx_study.table import digits_to_tell_apart
-from mjx_study.tasks import TASKS
+from mjx_study.tasks import TASKS, registered_name
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Recipe, Task
-from mjx_study.tasks.user_task import registered_name
 
 Result = TypeVar("Result")
 
@@ -78,12 +77,10 @@ class StudyPlan:
 
     @cached_property
     def settings(self) -> Settings:
-        """The configuration's."""
         return self.config.settings
 
     @cached_property
     def kind(self) -> "StudyKind":
-        """The kind of study."""
         return find_kind(self.settings.kind)
 
     @cached_property
@@ -110,7 +107,6 @@ class StudyPlan:
 
     @property
     def compilations(self) -> int:
-        """Number of programs to compile."""
         programs = {self.program_of(cell) for cell in self.cells} - {None}
         return self.kind.programs_per_key(self.config) * len(programs)
 
@@ -144,7 +140,6 @@ class StudyPlan:
 
     @property
     def contents(self) -> dict[str, str]:
-        """Digests of what the numbers depend on: the tasks in all their forms, and user-defined estimators."""
         forms: dict[str, list[Task]] = {}
         for group in self.groups:
             forms.setdefault(group.name, []).append(group.task)

@@ -52,7 +52,6 @@ class Tally:
 
 
 def together(tallies: Iterable[Tally]) -> Tally:
-    """Merge tallies."""
     return reduce(Tally.merged, tallies)
 
 

@@ -45,14 +45,7 @@ def reject_unused_options(
     first_order: bool = False,
 ) -> None:
     """Raise OptionError for an option that was given and has no effect in any cell, and ValueError for an onset
-    estimator without one.
-
-    Args:
-        config: the study, with the contact of a single run if it is one.
-        given: names of the options that the user gave.
-        grids: tasks, each with its contact models.
-        first_order: whether cells have means of first-order gradients with any estimators.
-    """
+    estimator without one; `first_order` says whether cells have means of first-order gradients with any estimators."""
     reject_unread(config.estimators, [name for name in (*ESTIMATOR_OPTIONS, "published") if name in given])
     simulated = [task for task, models in grids if not all(each.analytic for each in models)]
     touching = any(task.scene.has_constraints for task in simulated)

@@ -35,11 +35,8 @@ _CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjG
 class DegenerateContact:
     """A contact whose points are placed along a vanishing direction, in C and in MJX.
 
-    The step jumps there, and nearby it changes faster than differences can resolve.
-
-    Attributes:
-        movers: joints that move one of its bodies; the step jumps only in their positions.
-        moved: joints of the same kinematic trees, accelerated by its force.
+    The step jumps there, in the positions of the joints that move one of its bodies (`movers`), and accelerates those
+    of the same kinematic trees (`moved`); nearby it changes faster than differences can resolve.
     """
 
     cause: str
@@ -47,18 +44,13 @@ class DegenerateContact:
     moved: frozenset[int]
 
     def concerns(self, output: Coordinate, source: Coordinate) -> bool:
-        """Whether the contact's direction affects this entry."""
         return source.block in ("qpos", LENGTH) and source.joint in self.movers and output.joint in self.moved
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FindingContext:
-    """Where a finding occurs.
-
-    Attributes:
-        stages, qacc: MJX's intermediate quantities at the state, and its constrained acceleration.
-        solref, solimp: parameters of all geoms, with the contact model applied.
-    """
+    """Where a finding occurs: MJX's intermediate quantities at the state, its constrained acceleration, and the
+    parameters of all geoms with the contact model applied."""
 
     layout: Coordinates
     state: HostState

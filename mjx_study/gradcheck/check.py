@@ -38,8 +38,7 @@ class GradcheckPlan:
     Attributes:
         subject: the task; for a file, the result of `scene_task`.
         is_task: whether to check its cost.
-        cells: contact models to check in turn.
-        warnings: warnings about these contact models.
+        cells, warnings: contact models to check in turn, and the warnings about them.
         states: number of states per contact model.
         seed: random seed of initial states, states and directions.
         stock: whether to check the derivative of `mjx.step` too.
@@ -114,14 +113,8 @@ def plan_scene_gradcheck(
     Args:
         scene: the scene, in float64, with at least one degree of freedom.
         families: contact families; by default `mjcf`, or `mujoco` if a stiffness is given.
-        stiffnesses: stiffnesses for families that take one [N/m].
-        seed: random seed of the states.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
-        damping: override of each family's damping [N s/m].
-        smoothing: override of the smoothing kappa of laws other than MuJoCo's [J].
         horizon: number of steps of the rollout from which states are taken.
-        states: number of states per contact model.
-        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as for `plan_gradcheck`, or a stiffness without a pair.
@@ -214,7 +207,6 @@ def _summary(plan: GradcheckPlan) -> str:
 
 
 def _uncompared(checks: Sequence[StepCheck]) -> list[str]:
-    """Contact models whose step has no counterpart, with the number of states that were therefore not compared."""
     return [
         f"{check.label}: {plural(check.states, 'state')} not compared with mjx.step and the C engine, which have "
         "MuJoCo's law; its own differences judge the derivatives"

@@ -32,12 +32,8 @@ _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 
 @dataclasses.dataclass(frozen=True)
 class Coordinate:
-    """An entry of the flat vector or of a step's output.
-
-    Attributes:
-        block: qpos, quaternion length, qvel, act, ctrl or contact.
-        joint: index of the joint, if it has one.
-    """
+    """An entry of the flat vector or of a step's output; `block` is qpos, quaternion length, qvel, act, ctrl or
+    contact, and `joint` its joint's index, if it has one."""
 
     block: str
     name: str
@@ -65,7 +61,6 @@ class Coordinates:
 
     @property
     def num_state(self) -> int:
-        """Number of inputs other than contact parameters."""
         return len(self.inputs) - len(self.scales)
 
     def columns(self, *blocks: str) -> list[int]:
@@ -90,11 +85,8 @@ class Coordinates:
     def model(
         self, contact: ContactModel | None, scales: Float[Array, " parameters"], change: Float[Array, " parameters"]
     ) -> mjx.Model:
-        """Apply a contact model with its parameters changed in units of `scales`.
-
-        Parameters set by the contact model are changed there, so that derivatives pass through `apply_contact`; others
-        are changed in every geom and pair.
-        """
+        """Apply a contact model with its parameters changed in units of `scales`: those set by the contact model there,
+        so that derivatives pass through `apply_contact`, others in every geom and pair."""
         model = self.scene.model
         if not len(scales):
             return apply_contact(model, contact)

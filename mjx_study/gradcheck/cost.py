@@ -40,7 +40,6 @@ class CostPrograms:
         self._many = compiled("costs", self._costs_at, task, seed)
 
     def compile(self, contact: ContactModel | None) -> None:
-        """Start compiling the programs of the methods below."""
         self.compiler.start(self._both_modes, self.task.theta, contact, np.zeros((DIRECTIONS, len(self.task.theta))))
         self.compiler.start(self._many, np.zeros((BATCH, len(self.task.theta))), contact)
 

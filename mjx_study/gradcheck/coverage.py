@@ -36,12 +36,9 @@ _PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SP
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """Number of states that exercise each part of a model.
+    """Number of states that exercise each part that a model has, and the parts that no state exercises.
 
-    Attributes:
-        counts: number of states by part, for the parts that the model has.
-        missing: parts of the model that no state exercises.
-        unreachable: contact, or zones of it, that no pair of geoms can reach, with the number of pairs.
+    `unreachable` has contact, or zones of it, that no pair of geoms can reach, with the number of pairs.
     """
 
     states: int
@@ -50,7 +47,6 @@ class Coverage:
     unreachable: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def line(self) -> str:
-        """Describe the coverage; empty if the model has nothing to exercise."""
         parts, subparts = [], {"contact": ZONES, "limit": (), "friction loss": ("held", "slipping"), "equality": ()}
         for part, inner in subparts.items():
             if part in self.counts:
@@ -122,7 +118,6 @@ class Reach:
         self._balls = functools.cache(self._bounding_balls)
 
     def touch(self, pair: ContactPair) -> bool:
-        """Whether two geoms may come into contact."""
         if self._host.nmocap:  # may move anything fixed
             return True
         plane = self._host.geom_type[pair.first] == _PLANE

@@ -17,10 +17,7 @@ PARAMETERS: Final = ("geom_solref", "geom_solimp", "geom_friction", "pair_solref
 
 
 class EngineStep:
-    """The C engine's step over the same flat vector of changes, an independent map for differences.
-
-    For one scene, contact model and any integrator, with constraints solved to rounding.
-    """
+    """For one scene, contact model and any integrator, with constraints solved to rounding."""
 
     def __init__(self, layout: Coordinates, contact: ContactModel | None):
         self.layout = layout

@@ -6,7 +6,6 @@ one by one (`lax.map`) rather than as a batch.
 
 import dataclasses
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -14,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study.compiled import Compiled
+from mjx_study.compiled import Builds, Compiled
 from mjx_study.gradcheck.coordinates import Coordinates
-from mjx_study.gradcheck.engine_difference import STAGES
+from mjx_study.gradcheck.values import STAGES
 from mjx_study.identity import code_of
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
@@ -36,29 +35,21 @@ DIRECTIONS: Final = 96
 """Maximum number of directions, forwards or backwards, per call of a derivative program."""
 
 
-class Compiler:
+class Compiler(Builds):
     """Compiles programs fast, with little optimisation, in background threads."""
 
     def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="compile")
-        self._running: list[tuple[Compiled, Future[None]]] = []
-
-    def start(self, program: Compiled, *arguments: Any) -> None:
-        """Trace the program for the shapes of the arguments, and compile it in the background."""
-        options = OPTIONS if jax.default_backend() == "cpu" else None
-        self._running.append((program, self._pool.submit(program.ahead(*arguments, options=options))))
+        super().__init__(THREADS, OPTIONS if jax.default_backend() == "cpu" else None)
 
     def run(self, program: Compiled, *arguments: Any) -> Any:
         with awaited():
             self.start(program, *arguments)
-            for _, future in [each for each in self._running if each[0] is program]:
-                future.result()
-            self._running = [each for each in self._running if each[0] is not program]
+            self.wait(program)
             return program(*arguments)
 
 
 def compiled(name: str, function: Callable[..., Any], *made_of: Any) -> Compiled:
-    """A program of a check, made of the code of checks and what else the function captures."""
+    """A program made of the code of checks and what else the function captures."""
     return Compiled(function, name, *made_of, code_of(__name__))
 
 
@@ -71,11 +62,8 @@ class ContactCase(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Linear:
-    """Value and derivatives of a step at one state.
-
-    Attributes:
-        tape: reverse-mode Jacobian on the tape, if `reverse` uses the Jacobian program; else None.
-    """
+    """Value and derivatives of a step at one state; `tape` is the reverse-mode Jacobian on the tape, if `reverse` uses
+    the Jacobian program."""
 
     qpos: Float[np.ndarray, " nq"]
     residual: float
@@ -89,7 +77,7 @@ class Exact:
     """A step with constraints solved to rounding.
 
     Attributes:
-        after: state after the step, with the constrained acceleration as its warm start.
+        after: with the constrained acceleration as its warm start.
         stages: quantities before the constraint solve.
         outputs: (position relative to a reference, velocity, activation) after each change.
     """
@@ -115,7 +103,6 @@ class Programs:
         self._stock_step = compiled("mjx.step", self._step_of_mjx, *made_of)
 
     def start(self, case: ContactCase, base: HostState, *, stock: bool) -> None:
-        """Start compiling the programs of `linear`, `exact`, `stock_step` and, on request, `stock`."""
         point, inputs, outputs = _point(case, base), len(self.layout.inputs), len(self.layout.outputs)
         for size in reversed(self._sizes):
             self.compiler.start(self._linear, point, _unit_rows(0, size), _unit_rows(0, outputs))
@@ -138,7 +125,6 @@ class Programs:
         return Exact(_host(after, base), stages, outputs[: len(changes)])
 
     def linear(self, case: ContactCase, base: HostState) -> Linear:
-        """Compute the value and derivatives of the project's step at a state."""
         found = [self._derivatives(size, case, base) for size in self._sizes]
         own, tape = found[0], found[-1]
         if own is tape:

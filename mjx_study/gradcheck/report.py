@@ -36,13 +36,11 @@ OF_STEP: Final = (
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """An entry of a step's Jacobian that is not right.
+    """An entry of a step's Jacobian that is not right, such as d qvel[hinge] / d ctrl[motor].
 
     Attributes:
-        index: steps since the start of the rollout.
-        time: time since the start of the rollout [s].
-        name: name of the entry, such as d qvel[hinge] / d ctrl[motor].
-        derivative: derivative by automatic differentiation; for a differing step, this project's change.
+        index, time: steps and seconds since the start of the rollout.
+        derivative: by automatic differentiation; for a differing step, this project's change.
         difference: central difference, or None; for a differing step, the other implementation's change.
     """
 
@@ -57,15 +55,13 @@ class Entry:
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Entries that are not right, with a common cause.
+    """Entries that are not right, with a common cause; the text quotes the first as example.
 
     Attributes:
         contact: label of the contact model, such as penalty, K = 100 N/m.
         who: owner of the derivative: `project` or `mjx.step`.
         verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
         modes: differentiation modes that show it: forward, reverse, tape.
-        cause: likely cause, in one sentence.
-        entries: all affected entries, at any state; the text quotes the first as example.
     """
 
     contact: str
@@ -81,7 +77,6 @@ class Finding:
         return self.who == "project" and self.verdict in FAILURES
 
     def line(self) -> str:
-        """Describe the finding in a sentence, with one entry as example."""
         example, states = self.entries[0], len({entry.state for entry in self.entries})
         who = f"{self.who}: " if self.who != "project" else ""
         where = example.state if states == 1 else f"{states} states"
@@ -93,7 +88,6 @@ class Finding:
         return f"{who}{self.verdict} ({count}{modes}), as {example.name} {numbers}: {self.cause}"
 
     def numbers(self, entry: Entry) -> str:
-        """Format an entry's numbers, with those they are compared with."""
         if self.verdict == "jump" and entry.gap:
             return f"= {entry.derivative:.6g}, but differences reach {entry.gap:.2g}"
         other = OTHERS.get(self.verdict, "differences")
@@ -114,12 +108,12 @@ class CostCheck:
 
     Attributes:
         stiffness: K [N/m].
-        gradient_norm: norm of the gradient, in cost per unit of theta.
+        gradient_norm: in cost per unit of theta.
         modes: difference between reverse and forward mode along some directions.
         difference: difference from central differences along the same directions.
         one_sided: disagreement of the two one-sided differences at the smallest step.
-        closed_form: distance from the hand-written gradient of the reference system, a different model of the same
-            system; measures the distance between the models. None without a reference.
+        closed_form: distance from the hand-written gradient of the reference system, which measures the distance
+            between the two models of the system. None without a reference.
         residual: largest relative solver residual of the rollout.
         verdict: right, kink, jump, unconverged, nan or wrong.
     """
@@ -140,10 +134,8 @@ class StepCheck:
     """Checks of single steps for one contact model; errors are relative, the worst over the states.
 
     Attributes:
-        contact: name of the contact family.
         stiffness: K [N/m]; 0 if the contact model is not defined by one.
-        states: number of states checked.
-        entries: total number of Jacobian entries.
+        states, entries: number of states checked, and total number of Jacobian entries.
         unresolved: number of entries whose differences are too uncertain to judge.
         modes: difference between reverse and forward mode.
         differences: error of derivatives with respect to state and control, by central differences.
@@ -154,7 +146,6 @@ class StepCheck:
         engine: difference of the Jacobian from the C engine's where the steps agree; None if they never do.
         stock: error of the derivative of `mjx.step`; None if not requested, infinite if NaN.
         residual: largest relative solver residual.
-        coverage: parts of the model that the states exercise.
         verdict: worst of the findings on the project's derivative.
     """
 
@@ -184,13 +175,10 @@ class GradcheckReport:
     """All checks and findings, with the environment.
 
     Attributes:
-        subject: name of the task or file.
-        summary: size of the model, and what was checked, in one line.
         costs: checks of whole-horizon gradients, one per contact model; empty for a file.
         steps: checks of single steps, one per contact model.
-        findings: findings, worst first.
-        warnings: warnings about contact models and about features without a derivative.
-        environment: versions, machine, devices and precision.
+        findings: worst first.
+        warnings: about contact models and about features without a derivative.
     """
 
     subject: str
@@ -229,14 +217,12 @@ class GradcheckReport:
         return [*lines, f"{verdict}, where it was checked" if self.passed and self.unexercised else verdict]
 
     def _coverage_lines(self) -> list[str]:
-        """Coverage lines, with contact models that share a line grouped."""
         alike = grouped(self.steps, lambda check: check.coverage.line())
         labels = {line: ", ".join(check.label for check in checks) for line, checks in alike.items() if line}
         lines = [f"{label}: {line}" if len(alike) > 1 else line for line, label in labels.items()]
         return ["exercised", *lines, ""] if lines else []
 
     def _gaps(self) -> list[str]:
-        """Warnings about parts that no state exercised, grouped."""
         unexercised = self.unexercised
         return [
             f"{', '.join(labels)}: no state exercises {' and '.join(missing)}, whose derivatives are unchecked; try "

@@ -36,12 +36,7 @@ _SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HI
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sample:
-    """A state to check.
-
-    Attributes:
-        index: steps since the start of its rollout.
-        parts: parts of the model that it exercises.
-    """
+    """A state to check, `index` steps after the start of its rollout, with the parts of the model that it exercises."""
 
     label: str
     index: int
@@ -111,7 +106,6 @@ def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str],
 
 
 def _even(samples: list[Sample], count: int) -> list[Sample]:
-    """Up to `count` evenly spaced samples."""
     if count >= len(samples):
         return samples
     return [samples[int(round(index))] for index in np.linspace(0, len(samples) - 1, count + 2)[1:-1]]

@@ -50,7 +50,6 @@ class StateCheck:
     context: FindingContext
 
     def entry(self, name: str, derivative: float, difference: float | None = None, gap: float | None = None) -> Entry:
-        """An entry at this state."""
         time = self.sample.index * self.context.layout.scene.timestep
         return Entry(self.sample.label, self.sample.index, time, name, derivative, difference, gap)
 
@@ -113,8 +112,6 @@ def check_state(
 def step_check(
     cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck], found: Sequence[Finding], coverage: Coverage
 ) -> StepCheck:
-    """Summarise the checks of one contact model."""
-
     def worst(who: str, *blocks: str) -> float:
         return max(
             worst_error(layout, check.derivatives[mode], check.truth, codes, layout.columns(*blocks))

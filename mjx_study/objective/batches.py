@@ -36,7 +36,6 @@ class Simulator:
     """The compiled programs of a task.
 
     Attributes:
-        task: the task to simulate; each call replaces its scene's contact parameters.
         chunk_size: samples per device and call; see `chunk_for`.
         devices: devices to spread samples over; by default those of `mjx_study.runtime.local_devices`.
     """
@@ -75,19 +74,8 @@ class Simulator:
         return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def run(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, keys: Any, noise_scale: Any) -> Any:
-        """Run one of `SamplePrograms` on all samples; outputs as returned by `spread`.
-
-        Args:
-            name: name in `SamplePrograms`.
-            theta: parameters, (params,).
-            contact: the contact model; None for the MJCF's own.
-            sigma: standard deviation of the noise, in the unit of the quantity it is added to.
-            keys: data of each sample's key.
-            noise_scale: noise factor of each sample.
-
-        Raises:
-            ValueError: sigma or theta is invalid, or there are no samples.
-        """
+        """Run one of `SamplePrograms` on samples, given the data of their keys and their noise factors; outputs as
+        returned by `spread`. A ValueError if sigma or theta is invalid, or without samples."""
         check_sigma(sigma)
         if theta.shape != (self.task.policy.num_params,):
             raise ValueError(f"theta has shape {theta.shape}, the policy needs ({self.task.policy.num_params},)")
@@ -128,8 +116,7 @@ class MjxObjective:
     """F(theta) = E V_1 of a task with a contact model; implements `estimators.Objective`.
 
     Attributes:
-        simulator: the compiled programs, shared by all contact models of a sweep.
-        contact: the contact model; None for the MJCF's own.
+        contact: None for the MJCF's own.
         sigma: standard deviation of the noise, in the unit of the quantity it is added to.
     """
 
@@ -249,11 +236,7 @@ class MjxObjective:
 
 @dataclasses.dataclass(frozen=True)
 class BlankObjective(MjxObjective):
-    """An objective whose batches hold zeros: their shapes, without compiling the programs that they need.
-
-    Attributes:
-        programs: names in `SamplePrograms` of those needed so far.
-    """
+    """An objective whose batches hold zeros: their shapes, without compiling the `programs` that they need."""
 
     programs: dict[str, None] = dataclasses.field(default_factory=dict)
 
@@ -330,7 +313,6 @@ def _for_all(rows, samples: int):
 
 
 def _numpy_of(array: Any) -> Any:
-    """NumPy, or JAX's for its arrays."""
     return np if isinstance(array, np.ndarray) else jnp
 
 

@@ -30,7 +30,7 @@ def rollout_cost(
     """Compute the total cost V_1 of one rollout; everything that may be traced or differentiated is an argument.
 
     Args:
-        contact: the contact model; None for the MJCF's own.
+        contact: None for the MJCF's own.
         start: the initial state, before the policy acts on it.
         onset: "none", or "linear" or "jump" for a derivative with the onset term (see `mjx_study.simulation.onset` and
             `mjx_study.simulation.branches`).
@@ -93,9 +93,7 @@ def simulate(
     """Roll out one sample: states including the initial one, controls, cost and largest solver residual.
 
     Args:
-        task: the task, with the noise's density and standard deviation.
-        theta: policy parameters, (params,).
-        contact: the contact model; None for the MJCF's own.
+        contact: None for the MJCF's own.
         key: key of the sample; draws the initial state and noise as in a batch.
         noise_scale: factor of the noise; 0 for a zero-noise rollout.
     """

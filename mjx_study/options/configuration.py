@@ -10,12 +10,11 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, Protocol, Union, runtime_checkable
 
-from estimators.choices import DENSITIES, suggestion
+from estimators.choices import DENSITIES
 from estimators.registry import ESTIMATORS
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS
 from mjx_study.options.estimator_options import of_estimators, with_options_of_estimators
-from mjx_study.options.numbers import MAX_VALUES
-from mjx_study.options.option import OptionError, Rows, declared, options_of
+from mjx_study.options.option import MAX_VALUES, OptionError, Rows, declared, options_of
 from mjx_study.options.rules import check_span, reject_untaken
 
 if TYPE_CHECKING:
@@ -61,11 +60,7 @@ class NamedTask(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Options of a configuration with their defaults in place of None; those of other kinds of study have no effect.
-
-    Attributes:
-        points: number of thetas at which batches are drawn: one, unless along a line.
-    """
+    """Options of a configuration with their defaults in place of None; those of other kinds of study have no effect."""
 
     kind: str
     points: int = 1
@@ -205,14 +200,6 @@ class StudyConfig:
         None, "N", "samples held at once", "[2, 1e7]", study="gradients", unset="all, if they fit"
     )
 
-    def __new__(cls, **given: Any) -> "StudyConfig":
-        """Suggest a name for a misspelt one."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        for name in given:
-            if name not in names:
-                raise TypeError(f"{cls.__name__} has no option {name!r}{suggestion(name, names)}")
-        return super().__new__(cls)
-
     def __post_init__(self) -> None:
         for name, option in OPTIONS.items():
             if (value := self._named(name)) is not None or option.default is not None:
@@ -287,7 +274,6 @@ class StudyConfig:
 
     @property
     def task_names(self) -> list[str]:
-        """Names of the tasks."""
         return [each.name if isinstance(each, NamedTask) else each for each in self.tasks]
 
     @property

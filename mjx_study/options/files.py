@@ -31,12 +31,7 @@ POLICY_OPTIONS: Final = (
 
 @dataclasses.dataclass(frozen=True)
 class SavedPolicy:
-    """A policy written by `optimise`.
-
-    Attributes:
-        task: name of the task.
-        options: those of `POLICY_OPTIONS` under which it was found, unless they are None.
-    """
+    """Task of a policy written by `optimise`, and those of `POLICY_OPTIONS` under which it was found."""
 
     task: str
     options: Mapping[str, Any]

@@ -60,7 +60,6 @@ class Parser(argparse.ArgumentParser):
         self.add_argument(flag, action="store_true", help=line)
 
     def add_options(self, *names: str) -> None:
-        """Add options of a study's configuration, which fills in their defaults."""
         for name in names:
             self.add_option(name)
 
@@ -131,16 +130,13 @@ class Parser(argparse.ArgumentParser):
             self.add_option("smoothing")
 
     def add_estimator_options(self) -> None:
-        """Add the noise and the estimators' options; see `estimators.ESTIMATORS`."""
         self.add_options("noise", *ESTIMATOR_OPTIONS, "published", "onset")
 
     def add_backward_options(self, *, many: bool = True) -> None:
-        """Add the contact model of surrogate derivatives: one or many."""
         self.add_option("backward", many=many)
         self.add_options("backward_stiffness", "backward_margin")
 
     def add_process_options(self) -> None:
-        """Add seed, precision and devices."""
         self.add_option("seed")
         self.add_argument("--precision", choices=PRECISIONS, default="float64", help="default: float64")
         self.add_option(DEVICES)

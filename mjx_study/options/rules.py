@@ -25,12 +25,8 @@ def reject_untaken(families: Sequence[str], *, stiffness: object, damping: objec
 
 
 def reject_unused(given: Collection[str], *uses: tuple[Iterable[str], bool, str]) -> None:
-    """Raise OptionError for the first option that was given and has no effect.
-
-    Args:
-        given: names of the options that were given.
-        uses: options, whether they have an effect here, and the reason if they do not.
-    """
+    """Raise OptionError for the first option that was given and has no effect; `uses` are names of options, whether
+    they have one, and the reason if they have none."""
     for names, used, reason in uses:
         for name in names:
             if name in given and not used:

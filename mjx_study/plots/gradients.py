@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_study.choices import DEFAULT_SOLREF
-from mjx_study.plots.edges import limits, mark_undrawn, sane
 from mjx_study.plots.panels import (
     MOST_PANELS,
     against_stiffness,
@@ -17,11 +16,14 @@ from mjx_study.plots.panels import (
     estimators,
     families,
     geometric,
+    limits,
     line,
     make_logarithmic,
     make_panels,
+    mark_undrawn,
     model_title,
     positive,
+    sane,
     shade_unstable,
     stiffness_axis,
 )

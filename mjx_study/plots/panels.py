@@ -1,6 +1,7 @@
-"""Shared parts of study figures: panels by contact family, and estimator lines."""
+"""Shared parts of study figures: panels by contact family, estimator lines, and axes whose limits follow what is finite
+and stable, with marks at their edges for what cannot be drawn."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from mjx_study.plots.style import NO_CONTACT, TITLES, combines, line_with_band, style_of
 from mjx_study.results.rows import estimators_of, label_in
 from mjx_study.results.variables import COORDINATES
+from mjx_study.results.warnings import EXPLODED
 from mjx_study.simulation.contact import stable
 
 UNSTABLE: Final = "unstable step"
@@ -20,6 +22,13 @@ MOST_PANELS: Final = 6
 """Maximum number of contact models in a figure that has a panel, a row or a column for each."""
 SHIFT_RATIO: Final = 1.05
 """Ratio of the stiffnesses at which neighbouring estimators are drawn where they would hide each other."""
+UNDRAWN: Final = "no finite number (below: 0)"
+INSET: Final = 0.03
+"""Distance of crosses from the edges and half of that between them, as a share of the axis."""
+EXTRA: Final = 1e3
+"""Maximum ratio by which an axis goes on for contact models that it does not follow."""
+LARGEST: Final = 1e140
+"""Size to which numbers are limited, and the inverse of the smallest positive one: their squares do not overflow."""
 
 
 def make_panels(
@@ -38,13 +47,6 @@ def make_panels(
 def a_few(part: xr.Dataset) -> list[int]:
     """Indices of at most `MOST_PANELS` contact models, evenly spread."""
     return np.unique(np.linspace(0, part.sizes["model"] - 1, MOST_PANELS).round().astype(int)).tolist()
-
-
-def by_family(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
-    """Contact models by family, in order of stiffness."""
-    contact = part["contact"].values
-    names = dict.fromkeys(contact.tolist())
-    return [(name, part.isel(model=np.flatnonzero(contact == name)).sortby("stiffness")) for name in names]
 
 
 def make_logarithmic(axes: Axes, x: np.ndarray | None) -> None:
@@ -74,13 +76,16 @@ def model_title(one: xr.Dataset, between: str = ", ") -> str:
 
 
 def positions(rows: xr.Dataset) -> np.ndarray:
-    """Stiffnesses for a logarithmic axis [N/m]."""
     return np.where(rows["stiffness"].values > 0, rows["stiffness"].values, NO_CONTACT)
 
 
 def families(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
-    """Contact models by family, single-stiffness families grouped at the end."""
-    found = by_family(part)
+    """Contact models by family, in order of stiffness; families of a single stiffness grouped at the end."""
+    contact = part["contact"].values
+    found = [
+        (name, part.isel(model=np.flatnonzero(contact == name)).sortby("stiffness"))
+        for name in dict.fromkeys(contact.tolist())
+    ]
     lines = [(family, rows) for family, rows in found if rows.sizes["model"] > 1]
     points = [rows for _, rows in found if rows.sizes["model"] == 1]
     if points:
@@ -91,7 +96,6 @@ def families(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
 def against_stiffness(
     part: xr.Dataset, title: str, ylabel: str, draw: Callable[[Axes, xr.Dataset, np.ndarray], None], *, log: bool = True
 ) -> Figure:
-    """Plot one panel per contact family."""
     found = families(part)
     figure, grid = make_panels(1, len(found), 1.4 + 3.2 * len(found), 3.9, title, sharey=True)
     for axes, (family, rows) in zip(grid[0], found, strict=True):
@@ -180,3 +184,50 @@ def shade_unstable(axes: Axes, family: str, rows: xr.Dataset, x: np.ndarray) -> 
         spans = [(limit(x, solref, int(np.argmax(mask)), float(rows["timestep"])), x[-1] * 1.15)]
     for left, right in spans:
         axes.axvspan(left, right, color="0.5", alpha=0.13, linewidth=0, zorder=0, label=UNSTABLE)
+
+
+def drawable(values: xr.DataArray) -> xr.DataArray:
+    """Numbers that figures can compute with; infinite ones become NaN."""
+    if values.dtype.kind != "f":
+        return values
+    size = abs(values)
+    limited = xr.where(size > 0, np.sign(values) * size.clip(1 / LARGEST, LARGEST), values)
+    return limited.where(np.isfinite(values)).astype(values.dtype).transpose(*values.dims)
+
+
+def sane(rows: xr.Dataset, names: Sequence[str]) -> np.ndarray:
+    """Mask of the contact models that axes follow: the step is stable, and no value is missing or huge."""
+    fit = ~unstable(rows)
+    for each in (rows[name] for name in names if name in rows):
+        finite = abs(each) < EXPLODED  # and not NaN
+        fit &= np.asarray(finite.all([name for name in each.dims if name != "model"]))
+    return fit
+
+
+def limits(part: xr.Dataset, names: Sequence[str], room: float) -> tuple[float, float] | None:
+    """Ends of a logarithmic axis for variables: those of sane contact models times `room` to each side, and up to
+    `EXTRA` for the others; without sane ones the smallest values up to `EXTRA`. None without positive values."""
+
+    def known(mask: np.ndarray) -> np.ndarray:
+        some = part.isel(model=np.flatnonzero(mask))
+        values = np.concatenate([positive(some[name]).ravel() for name in names if name in some])
+        return values[np.isfinite(values)]
+
+    every = known(np.ones(part.sizes["model"], bool))
+    if not len(every):
+        return None
+    followed = known(sane(part, names))
+    low, high = (followed.min(), followed.max()) if len(followed) else (every.min(), every.min())
+    every = every[(every >= low / EXTRA) & (every <= high * EXTRA)]
+    return float(every.min()) / room, float(every.max()) * room
+
+
+def mark_undrawn(axes: Axes, x: np.ndarray, values: np.ndarray, style: Mapping[str, Any]) -> None:
+    """Mark values that a logarithmic axis cannot show with crosses at its edges: nonfinite ones above, zeros below."""
+    values, inset = np.asarray(values, float), INSET * (1 + 2 * style["rank"])
+    for missing, at in ((~np.isfinite(values), 1 - inset), (values <= 0, inset)):
+        if missing.any():
+            axes.plot(
+                x[missing], np.full(np.count_nonzero(missing), at), "x", color=style["color"], markersize=5,
+                transform=axes.get_xaxis_transform(), label=UNDRAWN,
+            )  # fmt: skip

@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from estimators.registry import label_of
-from mjx_study.plots.edges import UNDRAWN, drawable
-from mjx_study.plots.panels import UNSTABLE, families, make_panels, number, positive, unstable
+from mjx_study.plots.panels import UNDRAWN, UNSTABLE, drawable, families, make_panels, number, positive, unstable
 from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped
 from mjx_study.results.kind import Drawing, kind_of
 from mjx_study.results.rows import onset_of

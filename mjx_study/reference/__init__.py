@@ -6,13 +6,11 @@ from mjx_study.reference.function import (
     Function,
     Heaviside,
     Jump,
-    Quadratic,
     RelaxedHeaviside,
     ScalarFunction,
     Smoothed,
     smoothed,
 )
-from mjx_study.reference.linear_quadratic import LinearQuadratic
 from mjx_study.reference.objective import PARAMETRISATIONS, FunctionObjective, Reference, ReferenceObjective
 from mjx_study.reference.projectiles import BallWall, MomentumTransfer
 from mjx_study.reference.system import Gradients, QuadraticCost, Rollout, System, roll_out, value_and_gradients
@@ -21,7 +19,7 @@ from mjx_study.reference.two_bodies import Pusher, SlidingBox
 
 __all__ = [
     "PARAMETRISATIONS", "BallWall", "ClosedForm", "DoublePendulum", "Function", "FunctionObjective", "Gradients",
-    "Heaviside", "Jump", "LinearQuadratic", "MomentumTransfer", "Pusher", "Quadratic", "QuadraticCost", "Reference",
+    "Heaviside", "Jump", "MomentumTransfer", "Pusher", "QuadraticCost", "Reference",
     "ReferenceObjective", "RelaxedHeaviside", "Rollout", "ScalarFunction", "SlidingBox", "Smoothed", "System",
     "Tennis", "draw_start", "roll_out", "smoothed", "tennis_metrics", "value_and_gradients",
 ]  # fmt: skip

@@ -61,14 +61,6 @@ class DoublePendulum:
             total = total + weight * slope
         return identity + h / 6 * total, np.zeros((*state.shape, 0))
 
-    def energy(self, state: States) -> Costs:
-        """Kinetic plus potential energy, the latter 0 at the pivot's height [J]."""
-        first, second, mixed = self._inertia(state)
-        v1, v2 = state[..., 2], state[..., 3]
-        kinetic = 0.5 * self.mass * self.length**2 * (first * v1**2 + 2 * mixed * v1 * v2 + second * v2**2)
-        height = -self.length * (2 * np.cos(state[..., 0]) + np.cos(state[..., 0] + state[..., 1]))
-        return np.asarray(kinetic + self.mass * self.gravity * height)
-
     def accelerations(self, state: States) -> Float[np.ndarray, "*batch 2"]:
         return self._solve(state, self._torques(state)[..., None])[..., 0]
 

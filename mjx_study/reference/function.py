@@ -77,13 +77,8 @@ class ScalarFunction(Function, Protocol):
 
 @runtime_checkable
 class ClosedForm(Protocol):
-    """A function smoothed in closed form, without quadrature.
+    """A function smoothed by Gaussian noise in closed form, without quadrature."""
 
-    The closed form holds for Gaussian noise, or with `any_noise` for every density of variance sigma^2.
-    """
-
-    @property
-    def any_noise(self) -> bool: ...
     def smoothed(self, theta: Theta, sigma: float) -> Smoothed: ...
 
 
@@ -105,7 +100,7 @@ def smoothed(function: Function, theta: Theta, sigma: float, noise: str = "gauss
     density = check_density(noise)
     if theta.shape != (function.num_params,):
         raise ValueError(f"theta must have shape ({function.num_params},), got {theta.shape}")
-    if isinstance(function, ClosedForm) and (function.any_noise or noise == "gaussian"):
+    if isinstance(function, ClosedForm) and noise == "gaussian":
         return function.smoothed(theta, sigma)
     if not isinstance(function, ScalarFunction):
         raise TypeError(
@@ -149,49 +144,12 @@ def _copies(point: float, period: float, centre: float, reach: float) -> Float[n
     return candidates[np.abs(candidates - centre) < reach]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Quadratic:
-    """x^T A x / 2 + b^T x + c, the benchmark on which every unbiased estimator must agree.
-
-    Attributes:
-        matrix: A, (params, params), symmetric.
-        linear: b.
-        offset: c.
-    """
-
-    matrix: Float[np.ndarray, "..."]
-    linear: Theta
-    offset: float = 0.0
-    any_noise: bool = dataclasses.field(default=True, init=False)
-
-    def __post_init__(self) -> None:
-        size = len(self.linear)
-        if self.matrix.shape != (size, size) or not np.array_equal(self.matrix, self.matrix.T):
-            raise ValueError(f"matrix must be symmetric of shape ({size}, {size}), to match linear; got {self.matrix}")
-
-    @property
-    def num_params(self) -> int:
-        return len(self.linear)
-
-    def value(self, x: Points) -> Values:
-        return np.asarray(np.einsum("...i,ij,...j->...", x, self.matrix, x) / 2 + x @ self.linear + self.offset)
-
-    def gradient(self, x: Points) -> Points:
-        return x @ self.matrix + self.linear
-
-    def smoothed(self, theta: Theta, sigma: float) -> Smoothed:
-        """F = f + sigma^2 tr A / 2, grad F = grad f."""
-        value = float(self.value(theta)) + sigma**2 * np.trace(self.matrix) / 2
-        return Smoothed(float(value), self.gradient(theta), np.zeros(self.num_params))
-
-
 @dataclasses.dataclass(frozen=True)
 class Heaviside:
     """1 where x >= 0, else 0."""
 
     num_params: int = 1
     period: float = math.inf
-    any_noise: bool = dataclasses.field(default=False, init=False)
 
     def value(self, x: Points) -> Values:
         return np.asarray(x[..., 0] >= 0, float)
@@ -224,7 +182,6 @@ class RelaxedHeaviside:
     width: float
     num_params: int = 1
     period: float = math.inf
-    any_noise: bool = dataclasses.field(default=False, init=False)
 
     def __post_init__(self) -> None:
         if not (self.width > 0 and math.isfinite(self.width)):

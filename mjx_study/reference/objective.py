@@ -215,12 +215,9 @@ class ReferenceObjective(_Rollouts):
     - "start": x_1 = theta + w, all controls 0; theta is the initial state.
 
     Attributes:
-        system: the system, with its cost.
         start: initial state, or a function of a key that draws one; each sample then has its own zero-noise rollout as
             baseline. None if theta is the initial state.
-        horizon: number of steps.
         sigma: standard deviation of the noise, in the unit of the quantity it is added to.
-        parametrises: meaning of theta, see above.
         noise: name of the noise density in `estimators.NOISES`.
         metrics: function that computes named metrics from rollout states including the initial one; None for none.
     """
@@ -283,10 +280,7 @@ class FunctionObjective(_Rollouts):
     Its samples are rollouts without steps, from theta + w, with f as the final cost. There is no initial state to draw,
     and there are no metrics.
 
-    Attributes:
-        function: f.
-        sigma: standard deviation of the noise, in the unit of theta.
-        noise: name of the noise density in `estimators.NOISES`.
+    Sigma is in the unit of theta.
     """
 
     function: Function

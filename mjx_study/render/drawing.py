@@ -33,7 +33,6 @@ class Drawing:
 
     @cached_property
     def bounds(self) -> Bounds:
-        """Visible part of the plane."""
         return bounds(self.motion, self.view)
 
     @cached_property

@@ -43,9 +43,6 @@ _SMALL: Final[dict[str, Any]] = {"fontsize": "small", "color": "0.2"}
 def strip(motion: Motion, *, frames: int = 6, view: str = "auto", renderer: str = "auto") -> Figure:
     """Show a motion at evenly spaced times, first and last included, each picture labelled with its time.
 
-    Args:
-        frames: number of pictures; fewer if the motion has fewer times.
-
     Raises:
         ValueError: fewer than one picture, or an unknown view or renderer.
         RenderError: opengl does not work here.
@@ -110,7 +107,7 @@ def stroboscope(motion: Motion, *, poses: int = 9, view: str = "auto") -> Figure
 
 
 def _place(figure: Figure, size: tuple[float, float], x: float, y: float, width: float, height: float) -> Axes:
-    """Axes at a place in a figure of some size [inches]."""
+    """All in inches."""
     return figure.add_axes((x / size[0], y / size[1], width / size[0], height / size[1]))
 
 
@@ -222,7 +219,6 @@ def _drawn(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
 
 
 def _labelled(drawing: Drawing, indices: np.ndarray, rendered: np.ndarray) -> np.ndarray:
-    """Frames from MuJoCo's renderer, with the time above each."""
     label, font = time_label(drawing.motion.time[indices]), ImageFont.load_default(14)
     frames = np.pad(rendered, ((0, 0), (_LABEL, 0), (0, 0), (0, 0)), constant_values=255)
     for frame, index in zip(frames, indices, strict=True):

@@ -64,12 +64,9 @@ class Poses:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Motion:
-    """A model's motion.
+    """Generalised positions of a model [m or rad; unit quaternions] at increasing times [s].
 
-    Attributes:
-        time: increasing times [s].
-        qpos: generalised positions at these times [m or rad; unit quaternions].
-        focus: geoms shown in every picture, however far they are from the motion.
+    Geoms in `focus` are shown in every picture, however far they are from the motion.
     """
 
     model: mujoco.MjModel
@@ -116,7 +113,6 @@ class Motion:
 
     @cached_property
     def poses(self) -> Poses:
-        """Forward kinematics at every time."""
         model, data = self.model, mujoco.MjData(self.model)
         count = len(self.time)
         position, rotation = np.empty((count, model.ngeom, 3)), np.empty((count, model.ngeom, 9))
@@ -131,12 +127,8 @@ class Motion:
 
     def at(self, count: int) -> Int[np.ndarray, " count"]:
         """Indices of `count` evenly spaced times from first to last, or of all if there are fewer."""
-        if len(self.time) == 1:
-            return np.zeros(1, int)
         wanted = np.linspace(self.time[0], self.time[-1], count)
-        after = np.clip(np.searchsorted(self.time, wanted), 1, len(self.time) - 1)
-        nearer = np.where(wanted - self.time[after - 1] <= self.time[after] - wanted, after - 1, after)
-        return np.unique(nearer)
+        return np.unique(np.argmin(np.abs(self.time[:, None] - wanted), axis=0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +143,6 @@ class Bounds:
         return self.high - self.low
 
     def united(self, other: "Bounds") -> "Bounds":
-        """Smallest rectangle around both."""
         return Bounds(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def cut(self, other: "Bounds") -> "Bounds | None":

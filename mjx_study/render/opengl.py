@@ -47,9 +47,7 @@ class RenderError(ValueError):
 def resolve_renderer(name: str) -> str:
     """Resolve a renderer's name to `drawing` or `opengl`; auto is opengl if it works.
 
-    Raises:
-        ValueError: unknown name.
-        RenderError: opengl does not work here.
+    Raises ValueError for an unknown name, RenderError if opengl was asked for and does not work here.
     """
     if name not in RENDERERS:
         raise ValueError(unknown("renderer", name, RENDERERS))
@@ -66,9 +64,7 @@ def images(
 ) -> UInt8[np.ndarray, "frames height width 3"] | None:
     """Render a motion at some of its times with MuJoCo; return None if the renderer is `drawing`.
 
-    Raises:
-        ValueError: unknown renderer.
-        RenderError: opengl was requested by name and does not work here or fails on this model.
+    Raises as `resolve_renderer`, also if opengl was asked for and fails on this model.
     """
     if resolve_renderer(renderer) == "drawing":
         return None
@@ -111,7 +107,6 @@ def _render(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
 
 
 def _chosen() -> str:
-    """Backend set by the user, or an empty string."""
     return os.environ.get("MUJOCO_GL", "").strip().lower()
 
 
@@ -157,7 +152,6 @@ def _run(arguments: list[str], backend: str, timeout: float | None) -> str | Non
 
 
 def _image_size(size: np.ndarray) -> tuple[int, int]:
-    """Width and height in pixels, both even."""
     ratio = float(np.clip(size[0] / size[1], 1 / _LONGEST, _LONGEST))
     width, height = (_PIXELS, _PIXELS / ratio) if ratio >= 1 else (_PIXELS * ratio, _PIXELS)
     return 2 * round(width / 2), 2 * round(height / 2)

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
@@ -12,7 +11,7 @@ import xarray as xr
 
 from estimators import ESTIMATORS, ORACLES
 from mjx_study.results.rows import BIASED_P_VALUE, SETTING, Row, label_in, rows_of
-from mjx_study.table import digits_to_tell_apart, percent
+from mjx_study.table import digits_to_tell_apart, grouped, percent
 
 OFF_SE: Final = 4.0
 """Standard errors beyond which a mean without a verdict is reported as off."""
@@ -83,10 +82,7 @@ def _by_family(dataset: xr.Dataset, rows: Iterable[Row], of: Callable[[list[Row]
 
 def _by(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
     """Rows by some of their variables, in the order of the first ones."""
-    groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[tuple(getattr(row, name) for name in names)].append(row)
-    return groups
+    return grouped(rows, lambda row: tuple(getattr(row, name) for name in names))
 
 
 def _setting(name: str, value: Any) -> str:

@@ -93,7 +93,6 @@ def find_kind(name: str) -> Any:
 
 
 def kind_of(dataset: xr.Dataset) -> StudyResults:
-    """The kind of a study's Dataset."""
     return find_kind(json.loads(dataset.attrs["config"])["kind"])
 
 

@@ -56,7 +56,6 @@ def _text(name: str, variable: Variable, one: xr.Dataset) -> str:
 
 
 def shown(value: Any) -> str:
-    """Format a value of a configuration."""
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, list):

@@ -26,7 +26,6 @@ class Variable:
 
     @property
     def label(self) -> str:
-        """Label of an axis."""
         return re.split("[,;]", self.description)[0] + (f" [{self.shown_unit}]" if self.shown_unit else "")
 
     def text(self, value: float | int | None) -> str:

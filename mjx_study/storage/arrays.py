@@ -70,7 +70,6 @@ def required(kind: StudyResults) -> list[str]:
 
 
 def sizes_of(document: Mapping[str, Any], index: int) -> dict[str, int]:
-    """Size of every dimension within a cell."""
     config, task = document["config"], document["resolved"][document["cells"][index]["at"]["task"]]
     return find_kind(config["kind"]).sizes(config, task.get("parameters", 1))
 

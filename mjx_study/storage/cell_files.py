@@ -1,6 +1,6 @@
-"""Files of one cell: its numbers or a checkpoint of them, and the reason why it could not be computed.
+"""The file of a cell: its numbers or a checkpoint of them.
 
-Each holds digests of its content, of the study and of the cell, and counts only if all three match.
+It holds digests of its content, of the study and of the cell, and counts only if all three match.
 """
 
 import dataclasses
@@ -11,40 +11,25 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
-from mjx_study.disk import MAX_BYTES, read_whole, write_whole
+from mjx_study.disk import read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
-from mjx_study.options.files import digest_of_json
 from mjx_study.storage.arrays import MOST_CELL_BYTES, read_arrays, write_arrays
-from mjx_study.storage.schema import validated
+from mjx_study.storage.manifest import validated
 
 VERSIONS: Final = "versions"
 """Entry that records the versions that computed a cell."""
 
 
-class _Failure(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-    reason: str
-    digest: str
-
-
 @dataclasses.dataclass(frozen=True)
 class CellFile:
-    """A file of a cell's numbers, and beside it one that states why they could not be computed.
-
-    Attributes:
-        study: digest of the study.
-        cell: digest of the cell's index and coordinates.
-    """
+    """File of a cell's numbers, with digests of the study, and of the cell's index and coordinates."""
 
     path: Path
     study: str
     cell: str
 
     def write(self, arrays: Mapping[str, np.ndarray], versions: Mapping[str, str]) -> None:
-        """Write numbers, and the versions that computed them."""
         kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
         digest = np.array([digest_of_arrays(kept), self.study, self.cell])
         write_whole(self.path, lambda file: write_arrays(file, {"digest": digest} | kept))
@@ -75,27 +60,6 @@ class CellFile:
             reason = f"does not fit the study ({reason_of(error)})"
             raise StudyError(f"{path} {reason}; move it away to compute it again") from error
         return arrays, versions
-
-    @property
-    def failure(self) -> Path:
-        return self.path.with_suffix(".failed")
-
-    def write_failure(self, reason: str) -> None:
-        failure = _Failure(reason=reason, digest=self._digest(reason))
-        write_whole(self.failure, failure.model_dump_json().encode())
-
-    def read_failure(self) -> str:
-        """Read why the cell could not be computed; StudyError if the file is damaged."""
-        try:
-            found = validated(_Failure, read_whole(self.failure, follow=False, most=MAX_BYTES))
-            if found.digest != self._digest(found.reason):
-                raise ValueError("its digest does not match")
-        except (OSError, ValueError) as error:
-            raise StudyError(f"{self.failure} is damaged ({reason_of(error)}); remove it") from error
-        return found.reason
-
-    def _digest(self, reason: str) -> str:
-        return digest_of_json({"reason": reason, "study": self.study, "place": self.cell})
 
 
 def digest_of_arrays(arrays: Mapping[str, np.ndarray]) -> str:

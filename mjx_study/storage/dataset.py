@@ -24,7 +24,11 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     """
     config, entries = document["config"], document["cells"]
     outer = tuple(entries[0]["at"])
-    cells = {index: (_solver(entries[index]) | dict(arrays), by) for index, (arrays, by) in cells.items()}
+    solver = [
+        {name: np.array(each.get(name) or [np.nan] * size) for name, size in (("solref", 2), ("solimp", 5))}
+        for each in entries
+    ]
+    cells = {index: (solver[index] | dict(arrays), by) for index, (arrays, by) in cells.items()}
     axes = dict(document["axes"])
     axes |= {name: [float(value) for value in axes[name]] for name in ("timestep", "sigma")}  # JSON may say 1
     kind = find_kind(config["kind"])
@@ -63,11 +67,6 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     dataset.attrs["missing_cells"] = len(entries) - len(cells)
     dataset.attrs["mixed_versions"] = _mixture([versions for _, versions in cells.values()])
     return dataset
-
-
-def _solver(cell: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    sizes = {"solref": 2, "solimp": 5}
-    return {name: np.array(cell.get(name) or [np.nan] * size) for name, size in sizes.items()}
 
 
 def _mixture(versions: Sequence[Mapping[str, str]]) -> str:

@@ -4,7 +4,6 @@
                      and a digest of all that
     cells/00042.npz  one cell's numbers, with digests of these, of the study and of the cell's coordinates
     cells/00042.part.npz  checkpoint of an unfinished cell (descents, or batches in blocks)
-    cells/00042.failed    why a cell could not be computed, with a digest; the next run retries
     results.nc       all cells as one NetCDF file, written after the last and never read
     study.lock       which cells are being computed, and by which process
 
@@ -160,22 +159,11 @@ class Store:
         return os.path.lexists(self.path(index))
 
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        file = self.file(index)
-        file.write(arrays, self._authors(index))
+        self.file(index).write(arrays, self._authors(index))
         self.part_path(index).unlink(missing_ok=True)
-        file.failure.unlink(missing_ok=True)
 
     def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         self.file(index, part=True).write(arrays, self._authors(index))
-
-    def write_failure(self, index: int, reason: str) -> None:
-        self.file(index).write_failure(reason)
-
-    @property
-    def failures(self) -> dict[int, str]:
-        """Reasons why missing cells could not be computed; StudyError if one is damaged."""
-        failed = [index for index in self.missing if os.path.lexists(self.path(index).with_suffix(".failed"))]
-        return {index: self.file(index).read_failure() for index in failed}
 
     def _authors(self, index: int) -> dict[str, str]:
         """Versions that computed a cell, including those of its checkpoint."""
@@ -187,7 +175,6 @@ class Store:
         return {name: " and ".join(dict.fromkeys(each)) for name, each in both.items()}
 
     def read(self, index: int) -> dict[str, np.ndarray]:
-        """Read the numbers of a cell; see `read_with_versions`."""
         return self.read_with_versions(index)[0]
 
     def read_part(self, index: int) -> dict[str, np.ndarray]:
@@ -195,7 +182,6 @@ class Store:
         return self.read_with_versions(index, part=True)[0] if os.path.lexists(self.part_path(index)) else {}
 
     def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
-        """Read all computed cells with their versions."""
         indices = range(len(self.document["cells"]))
         return {index: self.read_with_versions(index) for index in indices if self.has(index)}
 

@@ -45,13 +45,10 @@ def ball_wall(
     """Cost -(x / 10)^2, with x [m] the ball's final position.
 
     Args:
-        variant: shape of the wall: box or dome.
+        variant: shape of the wall: box or dome; another is a ValueError.
         horizon: number of 2 ms steps; the highest flight takes 330.
         model: name or path of a replacement MJCF, with the slide joints `x`, `z` in this order and the geoms `ball`,
             `wall`, `dome`.
-
-    Raises:
-        ValueError: unknown variant.
     """
     if variant not in VARIANTS:
         raise ValueError(unknown("variant of ball_wall", variant, VARIANTS))

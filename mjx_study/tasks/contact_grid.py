@@ -44,7 +44,6 @@ class ContactPoint:
 
     @property
     def analytic(self) -> bool:
-        """Whether this is the task's analytic system."""
         return self.family == REFERENCE
 
     @property
@@ -54,7 +53,6 @@ class ContactPoint:
 
     @property
     def label(self) -> str:
-        """Family, and stiffness if there is one."""
         return self.family if self.stiffness is None else f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m"
 
 
@@ -73,7 +71,6 @@ def family_grid(
 
     Args:
         task: source of the effective mass and of defaults for arguments that are None.
-        families: names of contact families; "reference" for the analytic system.
         stiffnesses: stiffnesses for families that take one [N/m].
         damping: override of each family's damping [N s/m].
         smoothing: override of the smoothing kappa of laws other than MuJoCo's [J].

@@ -42,11 +42,8 @@ def double_pendulum(
     """Cost |q|^2, with q [rad] the final angles, not wrapped, since wrapping would add jumps.
 
     Args:
-        start: initial state: default or published.
+        start: initial state: default or published; another is a ValueError.
         model: name or path of a replacement MJCF, with the hinges `first` and `second` in this order.
-
-    Raises:
-        ValueError: unknown start.
     """
     if start not in STARTS:
         raise ValueError(unknown("start of double_pendulum", start, STARTS))

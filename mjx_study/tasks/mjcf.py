@@ -36,7 +36,6 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     cost has no gradient, all parameters are raised by one standard deviation of the noise.
 
     Args:
-        scene: the scene; its contact parameters are those of the MJCF.
         pair: names of the two geoms whose contact stiffness is swept, or None.
 
     Raises:

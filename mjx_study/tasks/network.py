@@ -63,16 +63,10 @@ class Network(Feedback):
 
 
 def with_network(task: Task, hidden: tuple[int, ...], key: Key[Array, ""]) -> Task:
-    """Replace a task's policy with a network.
+    """Replace a task's policy with a network, its initial weights drawn with the key.
 
-    Its input is that of the task's linear feedback, or else positions, velocities and activations.
-
-    Args:
-        hidden: width of each hidden layer.
-        key: random key for the initial weights; consumed.
-
-    Raises:
-        ValueError: the task has an initial-state policy or no controls, or a layer has no units.
+    Its input is that of the task's linear feedback, or else positions, velocities and activations. A ValueError if the
+    task has an initial-state policy or no controls, or a layer has no units.
     """
     if task.policy.at_start or task.scene.host.nu == 0:
         raise ValueError(f"{task.name} has no control for a network to set: its policy chooses the initial state")

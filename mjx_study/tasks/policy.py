@@ -64,12 +64,7 @@ class Policy(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class NoisyControls:
-    """Base of policies with noise on the controls.
-
-    Attributes:
-        horizon: number of steps H.
-        controls: number of controls m.
-    """
+    """Base of policies with noise on the controls, m of them in each of H steps."""
 
     horizon: int
     controls: int
@@ -105,12 +100,7 @@ class OpenLoop(NoisyControls):
 
 @dataclasses.dataclass(frozen=True)
 class Feedback(NoisyControls):
-    """Base of feedback policies u_h = pi(phi(x_h), theta) + w_h.
-
-    Attributes:
-        num_features: length of phi.
-        features: feature map phi of the state.
-    """
+    """Base of feedback policies u_h = pi(phi(x_h), theta) + w_h with `num_features` features phi of the state."""
 
     num_features: int
     features: Callable[[State], Float[Array, " features"]]
@@ -148,12 +138,9 @@ class InitialStatePolicy:
 
     Attributes:
         num_params: length of theta and of the noise w.
-        horizon: number of steps H.
-        controls: number of controls m, all zero.
+        horizon, controls: numbers of steps H and of controls m, all zero.
         start_at: maps (start, theta + w) to the initial state of the simulation.
         unit: unit of theta; empty if unknown.
-        additive: True, since the noise is added to theta entry by entry.
-        at_start: True, since theta and the noise act on the initial state only.
     """
 
     num_params: int

@@ -23,11 +23,9 @@ from mjx_study.tasks.policy import Policy
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """Default settings for the optimisation of a task.
+    """Default settings for the optimisation of a task by plain gradient descent.
 
     Attributes:
-        learning_rate: learning rate of plain gradient descent.
-        iterations: number of descent steps.
         samples: batch size of the gradient estimate at each step.
         decay: exponent a of the learning-rate decay, learning_rate / i^a at iteration i = 1, 2, ...
     """
@@ -46,10 +44,8 @@ class Published:
     appendix bounds the variance by the second moment, whose printed sum must be a mean.
 
     Attributes:
-        gamma: accuracy bound, in the unit of the gradient.
-        radius: R in epsilon, constant for each example, in the unit of the gradient.
-        failure_probability: P in epsilon, as published.
-        variance_proxy: s2 in epsilon.
+        gamma, radius: accuracy bound, and R in epsilon, in the unit of the gradient.
+        failure_probability, variance_proxy: P and s2 in epsilon.
 
     Reference: Suh et al. 2022, appendix "Empirical Bernstein confidence", with its published examples' numbers.
     """
@@ -70,7 +66,6 @@ class StudyDefaults:
         damping: contact damping in families without a damping ratio [N s/m], or None; friction needs some, since it is
             the resistance to slip.
         gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default (inverse-variance weighting).
-        published: AoBG's constants in the published example, or None.
         recipe: settings of gradient descent; None if they must all be given.
         span: range of a landscape over a scalar parameter; None for a range about theta.
     """
@@ -111,7 +106,6 @@ class Task:
         description: one line, for tables and reports; by default that of the built-in task of this name.
         scene: the compiled model; a contact model replaces its contact parameters.
         horizon: number of steps H.
-        policy: maps theta, noise and state to initial state and controls.
         theta: default parameters, where gradients are taken, (params,). Weakly typed arrays are made strongly typed to
             avoid recompilation for the theta of a descent.
         sigma: standard deviation of the noise, in the unit of the quantity it is added to.
@@ -127,7 +121,6 @@ class Task:
             "linear" or "jump" to add what those miss (see `mjx_study.simulation.onset` and `.branches`).
         metrics: function that computes named metrics of a rollout, reported along with the cost, from its states
             including the initial one, (horizon + 1, ...), likewise; None for none.
-        defaults: defaults for studies of the task.
     """
 
     name: str
@@ -203,7 +196,6 @@ class Task:
         return running_cost, final_cost
 
     def replace(self, **changes) -> "Task":
-        """The task with other attributes."""
         return dataclasses.replace(self, **changes)
 
 

@@ -1,9 +1,13 @@
-"""Assertions about random quantities: a stated z-score, and a failure where the test has no power."""
+"""Assertions about random quantities, with a stated z-score and a failure without power; and about batches."""
 
+from collections.abc import Mapping
+from typing import Any
+
+import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from estimators import GradientEstimate
+from estimators import ORACLES, GradientEstimate, pull_back, truncated_first_order
 
 
 def assert_mean_is(per_sample: ArrayLike, exact: ArrayLike, *, z: float = 4.0, resolution: float = 0.05) -> None:
@@ -35,3 +39,22 @@ def assert_variance_is(
 
 def binomial_standard_error(probability: float, trials: int) -> float:
     return float(np.sqrt(probability * (1.0 - probability) / trials))
+
+
+def assert_batches_agree(batches: Mapping[str, Any], horizon: int, rtol: float = 1e-9) -> None:
+    """Values, scores and gradients are the same in whichever batch they are, and pairs have opposite noise."""
+
+    def close(one: jax.Array, other: jax.Array) -> None:
+        np.testing.assert_allclose(one, other, rtol=rtol, atol=1e-12 + rtol * np.abs(other).max())
+
+    evaluation, pair, steps, step_pair, gradients, _, by_step, linearisation = (batches[name] for name in ORACLES)
+    for value in (steps.value_to_go[:, 0], gradients.value, by_step.value, linearisation.steps.value_to_go[:, 0]):
+        close(value, evaluation.value)
+    close(steps.baseline_to_go[:, 0], evaluation.baseline)
+    close(linearisation.steps.baseline_to_go, steps.baseline_to_go)
+    close(pull_back(steps.noise_score, steps.policy_jacobian), evaluation.score)
+    close(pull_back(by_step.noise_gradient, by_step.policy_jacobian), gradients.gradient)
+    close(truncated_first_order(linearisation, horizon).per_sample, gradients.gradient)
+    for (plus, minus), whole, score in ((pair, evaluation, "score"), (step_pair, steps, "noise_score")):
+        jax.tree.map(close, plus, whole)
+        assert not np.allclose(getattr(minus, score), getattr(plus, score))

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from tests.fuzz import flips, folders, planning
+from tests.fuzz import flips, forgeries, planning
 from tests.fuzz.answers import Row
 
 Fuzzer = Callable[[str, int, Path], Row]
@@ -14,7 +14,7 @@ FUZZERS: Final[dict[str, tuple[Fuzzer, int]]] = {
     "options of every command": (planning.fuzz, 2600),
     "TOML files": (planning.fuzz, 800),
     **{kind: (flips.flip, count) for kind, count in flips.FLIPS.items()},
-    **{kind: (folders.forge, count) for kind, count in folders.FORGED.items()},
+    **dict.fromkeys(forgeries.FORGERIES, (forgeries.forge, 100)),
 }
 """Fuzzers by kind of input, and the number of inputs at full size."""
 

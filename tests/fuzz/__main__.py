@@ -12,13 +12,12 @@ import pytest
 
 from mjx_study import configure
 from mjx_study.cli import options as of_commands
-from mjx_study.table import format_table, markdown_table
+from mjx_study.table import markdown_table
 from tests.fuzz import FUZZERS, fuzz
 from tests.fuzz.answers import Row
 from tests.planted.__main__ import MARK as END
 
 BEGIN: Final = "<!-- from here on: make fuzz -->\n"
-HEADER: Final = ("input", "tried", "silent errors", "tracebacks", "hangs", "writes outside")
 
 
 def timed(kind: str, folder: Path, share: float) -> Row:
@@ -26,20 +25,15 @@ def timed(kind: str, folder: Path, share: float) -> Row:
     begun = time.monotonic()
     row = fuzz(kind, folder, share)
     codes = ", ".join(f"{count} x exit code {code}" for code, count in sorted(row.codes.items()))
-    told = f"{kind}: {row.inputs} inputs, {row.wrong} wrong, {codes}"
+    told = f"{kind}: {row.inputs} inputs, {len(row.wrong)} wrong, {codes}"
     print(f"{time.monotonic() - begun:7.1f} s  {told}", file=sys.stderr, flush=True)
     return row
 
 
-def cells(row: Row) -> list[str]:
-    """A row's entries."""
-    return [row.kind, *map(str, (row.inputs, row.silent, row.tracebacks, row.hangs, row.outside))]
-
-
 def markdown(rows: Sequence[Row]) -> str:
     """Format the table of the page."""
-    tried, wrong = sum(row.inputs for row in rows), sum(row.wrong for row in rows)
-    table = markdown_table([(row.kind, row.inputs, row.wrong) for row in rows], ("input", "tried", "wrong"))
+    tried, wrong = sum(row.inputs for row in rows), sum(len(row.wrong) for row in rows)
+    table = markdown_table([(row.kind, row.inputs, len(row.wrong)) for row in rows], ("input", "tried", "wrong"))
     return f"{tried:,} inputs, {wrong} answered wrongly.\n\n{table}\n"
 
 
@@ -61,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         configure(cache=folder / "cache", cpu_devices=1)
         monkeypatch.setattr(of_commands, "configure", lambda **_: None)
         rows = [timed(kind, folder, options.share) for kind in options.only or FUZZERS]
-    print("\n".join([line for row in rows for line in row.told] + format_table(list(map(cells, rows)), HEADER)))
+    print("\n".join(line for row in rows for line in row.wrong))
+    print(markdown(rows))
     if options.page is not None:
         put_into(options.page, markdown(rows))
     return int(any(row.wrong for row in rows))

@@ -36,57 +36,36 @@ class TooSlow(BaseException):
     """Raised when an answer takes too long."""
 
 
-class SilentError(AssertionError):
-    """Raised where something wrong is accepted, or refused without a line that says so."""
-
-
-class OutsideError(AssertionError):
-    """Raised where a file changes that is none of the command's."""
+class WrongError(AssertionError):
+    """Raised for an answer that a command must not give."""
 
 
 @dataclasses.dataclass
 class Row:
-    """Numbers of inputs of one kind, in all and of those that were answered wrongly.
+    """Inputs of one kind.
 
     Attributes:
-        silent: taken wrongly, or refused without a line.
-        outside: after which another file differed than the command's.
+        inputs: how many were tried.
         codes: how many ended with which exit code.
-        told: what was wrong.
+        wrong: what was wrong, of those that were answered wrongly.
     """
 
     kind: str
     inputs: int = 0
-    silent: int = 0
-    tracebacks: int = 0
-    hangs: int = 0
-    outside: int = 0
     codes: Counter[int] = dataclasses.field(default_factory=Counter)
-    told: list[str] = dataclasses.field(default_factory=list)
-
-    @property
-    def wrong(self) -> int:
-        return self.silent + self.tracebacks + self.hangs + self.outside
+    wrong: list[str] = dataclasses.field(default_factory=list)
 
     @contextlib.contextmanager
     def counting(self, what: Any) -> Generator[None]:
-        """Count an input, and in which way its answer is wrong."""
+        """Count an input, and an answer that is wrong, comes too late or is a traceback."""
         self.inputs += 1
         try:
             with limited(SECONDS):
                 yield
-            return
         except KeyboardInterrupt:
             raise
-        except TooSlow as error:
-            self.hangs, reason = self.hangs + 1, error
-        except SilentError as error:
-            self.silent, reason = self.silent + 1, error
-        except OutsideError as error:
-            self.outside, reason = self.outside + 1, error
         except BaseException as error:
-            self.tracebacks, reason = self.tracebacks + 1, error
-        self.told.append(f"{self.kind}: {what}: {type(reason).__name__} {reason}")
+            self.wrong.append(f"{self.kind}: {what}: {type(error).__name__} {error}")
 
 
 def answer(arguments: list[str], folder: Path, *, refuse: bool | None = None) -> int:
@@ -98,9 +77,7 @@ def answer(arguments: list[str], folder: Path, *, refuse: bool | None = None) ->
         refuse: whether the input must be refused, or must not; None for either.
 
     Raises:
-        SilentError: the input is taken wrongly, or refused without a line.
-        OutsideError: the folder has changed.
-        RuntimeError: a traceback was printed.
+        WrongError: the input is taken wrongly or refused without a line, a traceback is printed, or the folder changes.
     """
     before = contents_of(folder)
     out, err = io.StringIO(), io.StringIO()
@@ -112,19 +89,19 @@ def answer(arguments: list[str], folder: Path, *, refuse: bool | None = None) ->
         except SystemExit as stop:
             code = stop.code
             if not {"-h", "--version"} & set(arguments) and not any(each.startswith("--h") for each in arguments):
-                raise SilentError(f"left with {code}") from stop
+                raise WrongError(f"left with {code}") from stop
     told = err.getvalue()
     if "Traceback" in told:
-        raise RuntimeError(told)
+        raise WrongError(told)
     if code not in (0, 1, 2) or (refuse is not None and refuse != (code == 2)):
-        raise SilentError(f"exit code {code} of {arguments}: {told}")
+        raise WrongError(f"exit code {code} of {arguments}: {told}")
     lines = [line for line in told.splitlines() if not BESIDE.match(line)]
     if code and (len(lines) != 1 or not lines[0].startswith("mjx-study: ") or len(told) > MOST_TEXT):
-        raise SilentError(f"no single line: {told}")
+        raise WrongError(f"no single line: {told}")
     if code == 2 and out.getvalue() and arguments[0] != "sweep":  # which first states what it would compute
-        raise SilentError(f"prints before it refuses: {out.getvalue()}")
+        raise WrongError(f"prints before it refuses: {out.getvalue()}")
     if contents_of(folder) != before:
-        raise OutsideError("a file was touched")
+        raise WrongError("a file was touched")
     return code
 
 

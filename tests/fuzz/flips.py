@@ -15,7 +15,7 @@ from mjx_study.caches import ProgramCache
 from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.storage.folder import Store, load_study
 from tests.fuzz import studies
-from tests.fuzz.answers import Row, SilentError
+from tests.fuzz.answers import Row, WrongError
 
 FLIPS: Final = {"bit flips in files of studies": 1200, "bit flips in files of caches": 400}
 """Kinds, and numbers of flips at full size."""
@@ -57,14 +57,14 @@ def _of_studies(root: Path) -> Iterator[tuple[Path, Callable[[], int]]]:
             try:
                 numbers, shown = right[folder]
                 if _numbers(folder) != numbers or not load_study(folder).identical(shown):
-                    raise SilentError("read to other numbers")
+                    raise WrongError("read to other numbers")
             except StudyError as error:
                 refused = True
                 if "\n" in str(error):
-                    raise SilentError(f"more than a line: {error}") from None
-            needless = path.name.endswith((".part.npz", ".failed"))  # for drawing
+                    raise WrongError(f"more than a line: {error}") from None
+            needless = path.name.endswith(".part.npz")  # for drawing
             if command and studies.draw(folder, root / "nothing", command) != (2 if refused and not needless else 0):
-                raise SilentError(f"another exit code of {command}")
+                raise WrongError(f"another exit code of {command}")
             return 2 if refused else 0
 
         yield path, check
@@ -76,7 +76,7 @@ def _numbers(folder: Path) -> str:
     cells = {index: store.read(index) for index in range(len(store.document["cells"])) if store.has(index)}
     parts = {index: store.read_part(index) for index in store.missing}
     plain = {key: {name: array.tolist() for name, array in each.items()} for key, each in (cells | parts).items()}
-    return json.dumps([store.document, plain, store.failures], sort_keys=True)
+    return json.dumps([store.document, plain], sort_keys=True)
 
 
 def _of_caches(root: Path, draw: random.Random) -> Iterator[tuple[Path, Callable[[], int]]]:
@@ -90,9 +90,9 @@ def _of_caches(root: Path, draw: random.Random) -> Iterator[tuple[Path, Callable
 
     def check(path: Path, read: Callable[[Path], Any]) -> int:
         if read(path) is not None:
-            raise SilentError("damaged content was read")
+            raise WrongError("damaged content was read")
         if path.exists():
-            raise SilentError("a damaged file was kept")
+            raise WrongError("a damaged file was kept")
         return 2
 
     for _ in itertools.count():

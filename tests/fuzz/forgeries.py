@@ -9,6 +9,7 @@ import functools
 import io
 import json
 import os
+import random
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -22,6 +23,8 @@ from mjx_study.storage.cell_files import digest_of_arrays
 from mjx_study.storage.folder import Store, load_study
 from mjx_study.storage.manifest import sealed
 from tests.faults import put_no_file
+from tests.fuzz.answers import Row, WrongError
+from tests.fuzz.studies import STUDIES, draw, make, resume
 
 VALUES: Final = (
     None, True, -1, 0, 10**9, 10**30, 1e308, float("nan"), "", "$x^{", "../../x", "a\nb", [], [1], {}, {"a": 1}
@@ -149,7 +152,7 @@ def archives() -> dict[str, bytes]:
 
 
 def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
-    """Forgeries of the file of a cell, a checkpoint or a failure."""
+    """Forgeries of the file of a cell or a checkpoint."""
     whole = (folder / "cells" / "00000.npz").read_bytes()
     directory = whole.rindex(b"PK\x05\x06")
     members = archives() | {
@@ -186,23 +189,11 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
             np.savez(file.path, digest=signed, **kept)  # type: ignore[arg-type]
 
         yield f"versions of a cell: {name}", written, True
-    failures = (
-        b"", b"{", b"[]", b"\xff\xfe", b"[" * 10**5,
-        b'{"reason": 1, "digest": ""}', b'{"reason": "a\\nb", "digest": "0"}',
-    )  # fmt: skip
-    for content in failures:
-
-        def failed(at: Path, _: Path, content: bytes = content) -> None:
-            (at / "cells" / "00001.npz").unlink()
-            (at / "cells" / "00001.failed").write_bytes(content)
-            (at / "cells" / "nonsense.failed").write_bytes(content)
-
-        yield f"a failure of {content[:20]!r}", failed, False
 
 
 def entries(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
     """Forgeries of what lies in a folder: links, pipes, sockets, devices, folders and sparse files."""
-    places = ("study.json", "study.lock", "results.nc", "cells/00000.npz", "cells/00001.part.npz", "cells/00001.failed")
+    places = ("study.json", "study.lock", "results.nc", "cells/00000.npz", "cells/00001.part.npz")
 
     def cleared(at: Path, place: str) -> Path:
         if "00001" in place:
@@ -282,3 +273,27 @@ FORGERIES: Final = {
     "forged folders: files of cells": containers,
     "forged folders: links, pipes, devices": entries,
 }
+
+
+def forge(kind: str, count: int, root: Path) -> Row:
+    """Forge folders of each kind of study, and draw and resume them."""
+    row, root, outside = Row(kind), root / "studies", root / "outside"
+    made = {each: make(each, root) for each in STUDIES}
+    every = [(study, *each) for study, folder in made.items() for each in FORGERIES[kind](folder)]
+    for study, name, change, refuse in random.Random(0).sample(every, min(count, len(every))):
+        at = root / "forged"
+        for folder in (at, outside):
+            shutil.rmtree(folder, ignore_errors=True)
+        outside.mkdir()
+        (outside / "file").write_text("somebody's")
+        shutil.copytree(made[study], at)
+        change(at, outside)
+        with row.counting(f"{study}, {name}"):
+            codes = [draw(at, outside)]
+            if codes == [0]:
+                codes.append(draw(at, outside, "report"))
+            row.codes[codes[-1]] += 1
+            codes.append(resume(study, at, outside))
+            if refuse and 0 in codes:
+                raise WrongError(f"accepted: exit codes {codes}")
+    return row

@@ -28,14 +28,13 @@ def make(kind: str, root: Path) -> Path:
 
 
 def unfinished(whole: Path, folder: Path) -> Path:
-    """Copy a study and let it have everything that a folder may hold: a checkpoint and a failure of the last cell."""
+    """Copy a study and let it have everything that a folder may hold: a checkpoint of the last cell."""
     if not folder.exists():
         shutil.copytree(whole, folder)
         store = Store.open(folder)
         arrays, by = store.read_with_versions(1)
         store.file(1, part=True).write(arrays, by)
         store.path(1).unlink()
-        store.write_failure(1, "no memory")
     return folder
 
 

@@ -13,10 +13,9 @@ import pytest
 
 from mjx_study.gradcheck import coordinates as layouts
 from mjx_study.gradcheck.coordinates import Coordinates, make_coordinates
-from mjx_study.gradcheck.engine_difference import difference_of_engines
 from mjx_study.gradcheck.engine_step import EngineStep
 from mjx_study.gradcheck.programs import ContactCase, Exact, Programs
-from mjx_study.gradcheck.values import Values, compare_values
+from mjx_study.gradcheck.values import Values, compare_values, difference_of_engines
 from mjx_study.simulation import integration, patches
 from mjx_study.simulation.contact import contact_model
 from mjx_study.simulation.engine import HostState, host_data

@@ -160,7 +160,7 @@ REFERENCES: Final = (
     ),
     Defect(
         "first-order-variance",
-        "mjx_study/reference/linear_quadratic.py",
+        "experiments/linear_quadratic.py",
         "4 * sigma**2 * np.sum(square**2)",
         "4 * sigma**2 * np.trace(square) ** 2",
         "the square of a trace in place of the trace of a square",

@@ -12,10 +12,50 @@ from mjx_study.reference import (
     Heaviside,
     Jump,
     MomentumTransfer,
-    Quadratic,
     RelaxedHeaviside,
     ScalarFunction,
+    Smoothed,
 )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Quadratic:
+    """x^T A x / 2 + b^T x, with its smoothing by noise of any density in closed form."""
+
+    matrix: np.ndarray
+    linear: np.ndarray
+
+    @property
+    def num_params(self) -> int:
+        return len(self.linear)
+
+    def value(self, x: np.ndarray) -> np.ndarray:
+        return np.asarray(np.einsum("...i,ij,...j->...", x, self.matrix, x) / 2 + x @ self.linear)
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        return x @ self.matrix + self.linear
+
+    def smoothed(self, theta: np.ndarray, sigma: float) -> Smoothed:
+        value = float(self.value(theta) + sigma**2 * np.trace(self.matrix) / 2)
+        return Smoothed(value, self.gradient(theta), np.zeros(self.num_params))
+
+
+class Square:
+    """x^2 as a scalar function."""
+
+    num_params, period = 1, np.inf
+
+    def value(self, x: np.ndarray) -> np.ndarray:
+        return x[..., 0] ** 2
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        return 2 * x
+
+    def jumps(self) -> tuple[()]:
+        return ()
+
+    def breakpoints(self) -> tuple[()]:
+        return ()
 
 
 class FunctionCase(NamedTuple):
@@ -38,7 +78,7 @@ FUNCTIONS = {
     ),
 }
 QUADRATIC = FunctionCase(
-    Quadratic(np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]]), np.array([0.3, -1.0, 0.5]), 2.0),
+    Quadratic(np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]]), np.array([0.3, -1.0, 0.5])),
     np.array([1.5, -2.0, 1.0]),
     0.7,
 )

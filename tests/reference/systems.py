@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_study.reference import DoublePendulum, LinearQuadratic, Pusher, Rollout, SlidingBox, System, Tennis
+from experiments.linear_quadratic import LinearQuadratic
+from mjx_study.reference import DoublePendulum, Pusher, Rollout, SlidingBox, System, Tennis
 from tests.pusher_fixtures import INPUTS, ImpedancePusher
 
 RNG = np.random.default_rng(0)

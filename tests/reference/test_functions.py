@@ -10,12 +10,11 @@ from mjx_study.reference import (
     Function,
     Heaviside,
     MomentumTransfer,
-    Quadratic,
     RelaxedHeaviside,
     ScalarFunction,
     smoothed,
 )
-from tests.reference.functions import FUNCTIONS, JUMPING, QUADRATIC, FunctionCase, WithoutClosedForm
+from tests.reference.functions import FUNCTIONS, JUMPING, FunctionCase, Square, WithoutClosedForm
 from tests.reference.systems import differentiate
 
 ANGLES = np.linspace(-np.pi, np.pi, 4001)
@@ -54,8 +53,8 @@ def test_is_a_scalar_function(case: FunctionCase):
 
 
 def test_which_have_a_closed_form():
-    closed = [case.function for case in [*FUNCTIONS.values(), QUADRATIC] if isinstance(case.function, ClosedForm)]
-    assert [type(function) for function in closed] == [Heaviside, RelaxedHeaviside, Quadratic]
+    closed = [case.function for case in FUNCTIONS.values() if isinstance(case.function, ClosedForm)]
+    assert [type(function) for function in closed] == [Heaviside, RelaxedHeaviside]
 
 
 @scalar
@@ -126,28 +125,9 @@ def test_closed_forms_agree_with_quadrature(name: str, theta: float):
 
 def test_quadrature_is_exact_for_a_square():
     """F = theta^2 + sigma^2, through the same quadrature as the ball's."""
-    square = WithoutClosedForm(QuadraticWithoutBreaks())
-    exact = smoothed(square, np.array([1.3]), 0.4)
+    exact = smoothed(Square(), np.array([1.3]), 0.4)
     assert exact.value == pytest.approx(1.3**2 + 0.4**2, rel=1e-13)
     assert exact.gradient[0] == pytest.approx(2.6, rel=1e-12)
-
-
-class QuadraticWithoutBreaks:
-    """x^2 as a scalar function."""
-
-    num_params, period = 1, np.inf
-
-    def value(self, x: np.ndarray) -> np.ndarray:
-        return x[..., 0] ** 2
-
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        return 2 * x
-
-    def jumps(self) -> tuple[()]:
-        return ()
-
-    def breakpoints(self) -> tuple[()]:
-        return ()
 
 
 @pytest.mark.parametrize("name", ["ball_wall", "momentum_transfer"])
@@ -167,21 +147,6 @@ def test_wide_noise_goes_round_the_circle(name: str):
     missed = exact.gradient[0] - exact.jump_term[0]
     assert missed == pytest.approx(weight @ slopes, abs=1e-4 * np.abs(values).max())
     assert abs(exact.jump_term[0]) > 1e-3 * np.abs(values).max()
-
-
-def test_quadratic():
-    function, theta, sigma = QUADRATIC
-    assert isinstance(function, Quadratic)
-    points = np.random.default_rng(0).standard_normal((5, 3))
-    for column, axis in enumerate(np.eye(3)):
-        expected = differentiate(lambda t, axis=axis: function.value(points + t * axis), 1e-3)
-        np.testing.assert_allclose(function.gradient(points)[:, column], expected, rtol=1e-9, atol=1e-10)
-    exact = smoothed(*QUADRATIC)
-    # Exact for a quadratic: the mean over the 2^3 corners of the cube theta +- sigma.
-    corners = theta + sigma * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
-    assert exact.value == pytest.approx(function.value(corners).mean(), rel=1e-13)
-    np.testing.assert_allclose(exact.gradient, function.gradient(corners).mean(axis=0), rtol=1e-13)
-    np.testing.assert_array_equal(exact.jump_term, 0)
 
 
 @pytest.mark.parametrize("name", ["ball_wall", "ball_wall, far", "ball_wall, high"])
@@ -246,8 +211,6 @@ def test_the_jumping_ones_jump(name: str):
         (lambda: MomentumTransfer(edge=2.0), "edge must be an angle between 0 and pi/2, got 2.0"),
         (lambda: MomentumTransfer(restitution=1.5), "restitution must be from 0 to 1, got 1.5"),
         (lambda: MomentumTransfer(inertia_ratio=-0.1), "inertia_ratio must not be negative, got -0.1"),
-        (lambda: Quadratic(np.eye(3), np.zeros(2)), r"symmetric of shape \(2, 2\)"),
-        (lambda: Quadratic(np.triu(np.ones((2, 2))), np.zeros(2)), "matrix must be symmetric"),
         (lambda: smoothed(Heaviside(), np.zeros(1), 0.0), "sigma must be positive and finite"),
         (lambda: smoothed(Heaviside(), np.zeros(2), 1.0), r"theta must have shape \(1,\), got \(2,\)"),
     ],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimators import first_order, zeroth_order
-from mjx_study.reference import LinearQuadratic, ReferenceObjective, roll_out, value_and_gradients
+from mjx_study.reference import ReferenceObjective, roll_out, value_and_gradients
 from tests.estimators.statistics_helpers import assert_mean_is, assert_variance_is
 from tests.reference.systems import linear_quadratic
 
@@ -62,28 +62,3 @@ def test_moved_theta_is_seen():
     estimate = first_order(OBJECTIVE.differentiate(jnp.asarray(1.1 * CONTROLS.ravel()), keys(1)))
     with pytest.raises(AssertionError, match="off by"):
         assert_mean_is(estimate.per_sample, exact.gradient)
-
-
-@pytest.mark.parametrize(
-    ("name", "wrong", "match"),
-    [
-        ("transition", np.zeros(3), "must be matrices"),
-        ("control", np.zeros(3), "must be matrices"),
-        ("transition", np.zeros((3, 2)), r"transition must have shape \(3, 3\), got \(3, 2\)"),
-        ("control", np.zeros((2, 2)), r"control must have shape \(3, 2\), got \(2, 2\)"),
-        ("state_weight", np.zeros((2, 2)), r"state_weight must have shape \(3, 3\), got \(2, 2\)"),
-        ("control_weight", np.array([[1.0, 1.0], [0.0, 1.0]]), "control_weight must be symmetric"),
-        ("final_weight", np.triu(np.ones((3, 3))), "final_weight must be symmetric"),
-    ],
-)
-def test_refuses_matrices_that_do_not_fit(name, wrong, match):
-    matrices = {name: getattr(SYSTEM, name) for name in SYSTEM.__dataclass_fields__}
-    with pytest.raises(ValueError, match=match):
-        LinearQuadratic(**{**matrices, name: wrong})
-
-
-def test_refuses_a_sigma_of_zero():
-    with pytest.raises(ValueError, match="sigma must be positive and finite"):
-        SYSTEM.smoothed(np.array(START), CONTROLS, 0.0)
-    with pytest.raises(ValueError, match="sigma must be positive and finite"):
-        SYSTEM.first_order_variance(HORIZON, float("inf"))

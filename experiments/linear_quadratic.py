@@ -1,4 +1,4 @@
-r"""A linear system with quadratic cost, where every expectation has a closed form.
+r"""A linear system with quadratic cost of any size and units, where every expectation has a closed form.
 
     x' = A x + B u,   V = sum_h x_h^T Q x_h + u_h^T R u_h + x_{H+1}^T P x_{H+1}
 
@@ -12,42 +12,19 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from estimators.noise import check_sigma
 from mjx_study.reference.function import Smoothed
 from mjx_study.reference.system import ControlJacobians, Controls, Costs, StateJacobians, States
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LinearQuadratic:
-    """A linear-quadratic problem of any size and units.
+    """The matrices A, B, Q, R and P, the last three symmetric."""
 
-    Attributes:
-        transition: A, (states, states).
-        control: B, (states, controls).
-        state_weight: Q, (states, states), symmetric.
-        control_weight: R, (controls, controls), symmetric.
-        final_weight: P, (states, states), symmetric.
-    """
-
-    transition: Float[np.ndarray, "..."]
-    control: Float[np.ndarray, "..."]
-    state_weight: Float[np.ndarray, "..."]
-    control_weight: Float[np.ndarray, "..."]
-    final_weight: Float[np.ndarray, "..."]
-
-    def __post_init__(self) -> None:
-        if self.transition.ndim != 2 or self.control.ndim != 2:
-            raise ValueError("transition and control must be matrices")
-        states, controls = self.transition.shape[0], self.control.shape[1]
-        expected = {"transition": (states, states), "control": (states, controls)}
-        expected |= {"state_weight": (states, states), "final_weight": (states, states)}
-        expected |= {"control_weight": (controls, controls)}
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
-        for name in ("state_weight", "control_weight", "final_weight"):
-            if not np.array_equal(getattr(self, name), getattr(self, name).T):
-                raise ValueError(f"{name} must be symmetric")
+    transition: Float[np.ndarray, "states states"]
+    control: Float[np.ndarray, "states controls"]
+    state_weight: Float[np.ndarray, "states states"]
+    control_weight: Float[np.ndarray, "controls controls"]
+    final_weight: Float[np.ndarray, "states states"]
 
     @property
     def num_states(self) -> int:
@@ -81,7 +58,6 @@ class LinearQuadratic:
         self, start: Float[np.ndarray, " states"], controls: Float[np.ndarray, "horizon controls"], sigma: float
     ) -> Smoothed:
         """The exact F and grad F of an open loop; theta is `controls`, flattened."""
-        check_sigma(sigma)
         theta = controls.reshape(-1)
         square, linear, constant = self.quadratic_form(start, len(controls))
         value = theta @ square @ theta + 2 * linear @ theta + constant + sigma**2 * np.trace(square)
@@ -89,7 +65,6 @@ class LinearQuadratic:
 
     def first_order_variance(self, horizon: int, sigma: float) -> float:
         """Variance E|g - E g|^2 = 4 sigma^2 tr(M^2) of an open loop's first-order sample, for any theta and start."""
-        check_sigma(sigma)
         square, _, _ = self.quadratic_form(np.zeros(self.num_states), horizon)
         return float(4 * sigma**2 * np.sum(square**2))
 
