@@ -1,5 +1,6 @@
 """Gradients of other engines: the cells that need no other environment, the verdicts, and the page."""
 
+import itertools
 import json
 import math
 import subprocess
@@ -75,8 +76,10 @@ def test_a_scene_that_an_engine_lacks_is_a_dash_with_a_reason() -> None:
 
 
 def test_the_page_says_what_the_data_give() -> None:
-    text = PAGE.read_text()
-    assert replace_tables(text, tables(cells(CELLS), cells(CHECKS))) == text
+    text, found = PAGE.read_text(), cells(CELLS)
+    assert replace_tables(text, tables(found, cells(CHECKS))) == text
+    every = list(itertools.product(catalog.ENGINES, SCENES, TIMESTEPS))
+    assert f"Of {len(every)} cells, {sum(key not in found for key in every)} are [not measured]" in text
 
 
 def test_times_and_versions_are_those_of_the_cells() -> None:
@@ -89,13 +92,32 @@ def test_times_and_versions_are_those_of_the_cells() -> None:
     assert said["times"].splitlines()[2:] == [f"| {label} | 12 | - | - | 12 | - | - | - | - |"]
 
 
-def test_accusing_cells_are_accused_under_half_the_noise() -> None:
+def test_accusing_cells_are_accused_under_other_noise() -> None:
     checks, found = cells(CHECKS), cells(CELLS)
     assert set(checks) == set(command.CHECKED)
-    assert {verdict(each) for key, cell in checks.items() for each in (cell, found[key])} == {"biased"}
+    accused = [(cell, found[name, "toss", step]) for (name, _, step), cell in checks.items()]
+    assert {verdict(each) for pair in accused for each in pair} == {"biased"}
 
 
-def test_half_the_noise_is_half(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("engine", "step", "slope", "mean", "at_point"),
+    [
+        ("brax_spring", 0.005, 0.128, 0.370, 0.35448),
+        ("brax_spring", 0.002, 0.130, 0.341, 0.32910),
+        ("brax_positional", 0.005, 0.12, 0.34, -0.22303),
+    ],
+)
+def test_brax_from_higher_is_what_others_measured(
+    engine: str, step: float, slope: float, mean: float, at_point: float
+) -> None:
+    cell = cells(CHECKS)[engine, command.HIGH, step]
+    assert [cell["slope"], cell["mean"]] == pytest.approx([slope, mean], rel=0.02)
+    assert cell["derivative"] == pytest.approx(at_point, abs=6e-6)
+
+
+def test_a_variant_has_a_name_and_a_scene_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     seen = []
 
     def rollouts(scene, timestep, variant):
@@ -103,11 +125,12 @@ def test_half_the_noise_is_half(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
         return lambda thetas: Rollout(thetas, np.ones(len(thetas)), np.tile([0.0, 0.0, 1.0], (len(thetas), 1, 1)))
 
     monkeypatch.setattr(mujoco_family, "build", rollouts)
-    for how in ([], ["half"]):
-        monkeypatch.setattr(sys, "argv", ["worker", "mjx", "toss", "0.005", "quick", *how])
+    for name in ("toss", command.HALF):
+        monkeypatch.setattr(sys, "argv", ["worker", "mjx", name, "0.005", "quick"])
         worker.main()
     assert seen == [(SCENES["toss"].sigma / share, 0.005, "forward") for share in (1, 2)]
-    assert [verdict(json.loads(line)) for line in capsys.readouterr().out.splitlines()] == ["right"] * 2
+    written = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [verdict(each) for each in written] == ["right"] * 2 and written[1]["scene"] == command.HALF
 
 
 @pytest.mark.parametrize("name", ["slide", "box_flat"])

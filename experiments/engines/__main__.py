@@ -1,11 +1,12 @@
 """Measure the missing cells of engines that are installed, each in a process of its own, or write the page.
 
 python -m experiments.engines [--only ENGINE ...] [--scene SCENE ...] [--timestep H] [--quick]: appends to
-data/engines.jsonl a line per cell, so that the same command resumes; --quick has a quarter of the rollouts, into
-build/engines/quick.jsonl, which no page is made of. --jobs N measures N cells at a time, each on one core.
---here runs all in this interpreter in place of the engines' environments, and --into FILE keeps what is new apart:
-so a machine without a network measures what its PYTHONPATH has, and `merge FILE ...` adds that to the data.
-python -m experiments.engines check: repeats accusing cells under half the noise, into data/engines_checks.jsonl.
+data/engines.jsonl a line per cell, so that the same command resumes; --quick has a quarter of the rollouts, at the
+longer timestep, into build/engines/quick.jsonl, which no page is made of. --jobs N measures N cells at a time, each on
+one core. --here runs all in this interpreter in place of the engines' environments, and --into FILE keeps what is new
+apart: so a machine without a network measures what its PYTHONPATH has, and `merge FILE ...` adds that to the data.
+python -m experiments.engines check: repeats accusing cells under half the noise, and tosses from higher, into
+data/engines_checks.jsonl.
 python -m experiments.engines page: writes the tables of docs/engines.md.
 """
 
@@ -26,15 +27,19 @@ from typing import Final
 from experiments import ROOT
 from experiments.engines.catalog import ENGINES, HOME, interpreter
 from experiments.engines.page import CELLS, CHECKS, PAGE, cells, tables
-from experiments.engines.scenes import SCENES, TIMESTEPS
+from experiments.engines.scenes import SCENES, TIMESTEPS, VARIANTS
 from experiments.pages import write_tables
 
 LIMIT = 900
 """Seconds that a cell may take."""
 ONE_CORE: Final = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
 """Of cells of which several are measured at a time."""
-CHECKED: Final = tuple(itertools.product(("mjx", "brax_positional", "drake_sap"), ("toss",), TIMESTEPS))
-"""Accusing cells that `check` repeats."""
+HALF, HIGH = VARIANTS
+CHECKED: Final = (
+    *itertools.product(("mjx", "brax_positional", "drake_sap"), (HALF,), TIMESTEPS),
+    *itertools.product(("brax_spring", "brax_positional"), (HIGH,), TIMESTEPS),
+)
+"""Cells of `check`."""
 
 
 def run(arguments: argparse.Namespace, target: Path) -> int:
@@ -48,9 +53,9 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
         if not python.exists():
             print(f"{name}: not installed, skipped: python -m experiments.engines.install {ENGINES[name].environment}")
             continue
-        every = itertools.product(arguments.scene or SCENES, arguments.timestep or TIMESTEPS)
-        keys = [(name, *each) for each in every if arguments.what != "check" or (name, *each) in CHECKED]
-        todo += [(python, *key[:2], str(key[2])) for key in keys if key not in found]
+        steps = arguments.timestep or TIMESTEPS[: 1 if arguments.quick else None]
+        every = CHECKED if arguments.what == "check" else itertools.product((name,), arguments.scene or SCENES, steps)
+        todo += [(python, *key[:2], str(key[2])) for key in every if key[0] == name and key not in found]
     writing, cores = Lock(), SimpleQueue()
     pin = arguments.jobs > 1 and shutil.which("taskset") is not None
     for core in itertools.islice(itertools.cycle(sorted(os.sched_getaffinity(0)) if pin else [0]), arguments.jobs):
@@ -60,7 +65,7 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
         core = cores.get()
         python, *words = cell
         pinned = ["taskset", "-c", str(core)] * pin
-        how = ["quick"] * arguments.quick + ["half"] * (arguments.what == "check")
+        how = ["quick"] * arguments.quick
         command = [*pinned, python, "-m", "experiments.engines.worker", *words, *how]
         environment = {**os.environ, **ONE_CORE} if arguments.jobs > 1 else None
         said, failed, began = "measured", False, time.perf_counter()
@@ -97,7 +102,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m experiments.engines", description=__doc__)
     parser.add_argument("what", nargs="?", choices=("measure", "check", "page", "merge"), default="measure")
     parser.add_argument("files", nargs="*", type=Path, help="of merge")
-    parser.add_argument("--quick", action="store_true", help="a quarter of the rollouts, kept apart from the data")
+    parser.add_argument(
+        "--quick", action="store_true", help="a quarter of the rollouts, one timestep, apart from the data"
+    )
     parser.add_argument("--only", nargs="+", choices=tuple(ENGINES), help="these engines", metavar="ENGINE")
     parser.add_argument("--scene", nargs="+", choices=tuple(SCENES), help="these scenes", metavar="SCENE")
     parser.add_argument("--timestep", nargs="+", type=float, choices=TIMESTEPS, help="[s]")

@@ -96,7 +96,6 @@ ENGINES: Final = {
         "old",
         "Warp's tape",
         single=True,
-        left="a positive control, whose bodies touch nothing",
     ),
     "jaxsim": Engine("JaxSim 0.9.0, soft", "jaxsim", "jaxsim_soft", "SemiImplicitEuler", "reverse mode"),
     **{
@@ -116,9 +115,7 @@ ENGINES: Final = {
         )
         for name, how in (("plain", "torch's tape"), ("soft", "torch's tape, differentiable_mode"))
     },
-    "old_mjx": Engine(
-        "MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode", left="a control, of the toss alone"
-    ),
+    "old_mjx": Engine("MJX 3.1.6", "old_mjx", "mujoco_family", "forward", "forward mode"),
 }
 
 

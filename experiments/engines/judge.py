@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.engines.scenes import LENGTH, PIVOT, RADIUS, SCENES, Scene, Simulate
+from experiments.engines.scenes import LENGTH, PIVOT, RADIUS, Scene, Simulate, scene_named
 
 REACH: Final = 5.0
 """The grid's half width, in standard deviations."""
@@ -117,7 +117,7 @@ def verdict(cell: Mapping[str, Any]) -> str:
     slope, mean = cell["slope"], cell["mean"]
     if not all(math.isfinite(cell[key]) for key in ("slope", "mean", "mean_of_strata", "point_error")):
         return "unknown"
-    if max(abs(slope), abs(mean)) * SCENES[cell["scene"]].sigma < STILL:
+    if max(abs(slope), abs(mean)) * scene_named(cell["scene"]).sigma < STILL:
         return "at rest"
     unsure = max(abs(slope - cell["slope_by_differences"]), cell["slope_error"])
     vague = max(abs(mean - cell["mean_of_strata"]), cell["mean_error"])
@@ -136,7 +136,7 @@ def lost_constraint(cell: Mapping[str, Any]) -> str | None:
     `no joint` if a pendulum's length is off by a tenth or NaN."""
     if "state" not in cell:
         return None
-    scene, (x, _, z) = SCENES[cell["scene"]], cell["state"][0]
+    scene, (x, _, z) = scene_named(cell["scene"]), cell["state"][0]
     if scene.bodies[0].shape == "pendulum":
         return None if abs(math.hypot(x, z - PIVOT) - LENGTH) < 0.1 * LENGTH else "no joint"
     return "no contact" if (scene.floor and z < RADIUS / 2) or (scene.wall and x > scene.wall - RADIUS / 2) else None

@@ -10,12 +10,14 @@ from typing import Any, Final
 from experiments import DATA, DOCS
 from experiments.engines.catalog import ENGINES, ENVIRONMENTS
 from experiments.engines.judge import combined, verdict
-from experiments.engines.scenes import SCENES, TIMESTEPS
+from experiments.engines.scenes import SCENES, TIMESTEPS, scene_named
 from experiments.pages import markdown_row
 
 CELLS: Final = DATA / "engines.jsonl"
 CHECKS: Final = DATA / "engines_checks.jsonl"
-"""Cells under half the noise."""
+"""Cells of variants of the scenes."""
+TRIAL: Final = DATA / "engines_trial.jsonl"
+"""Seconds that cells of `--quick` took."""
 PAGE: Final = DOCS / "engines.md"
 Cells = Mapping[tuple[str, str, float], Mapping[str, Any]]
 
@@ -34,7 +36,7 @@ def tables(found: Cells, checks: Cells) -> dict[str, str]:
         verdicts = (combined(row).replace("right", "**right**") for row in rows)
         matrix.append(markdown_row(engine.label, engine.how, *verdicts))
     kinds = {"matrix": "\n".join(matrix), "reasons": _reasons(found), "times": _times(found)}
-    kinds |= {"versions": _versions(found), "checks": _checks(found, checks)}
+    kinds |= {"versions": _versions(found), "checks": _checks(found, checks), "trial": _trial(cells(TRIAL))}
     return kinds | {each: _numbers(found, each) for each in SCENES}
 
 
@@ -48,6 +50,16 @@ def _times(found: Cells) -> str:
             rows.append(
                 markdown_row(engine.label, *(f"{float(f'{1000 * time:.2g}'):g}" if time else "-" for time in times))
             )
+    return "\n".join(rows)
+
+
+def _trial(found: Cells) -> str:
+    """Minutes that cells of `--quick` took, by engine."""
+    rows = [markdown_row("engine", "cells", "minutes"), "|---|---|---|"]
+    for name, engine in ENGINES.items():
+        seconds = [cell["seconds"] for key, cell in found.items() if key[0] == name]
+        if seconds:
+            rows.append(markdown_row(engine.label, str(len(seconds)), f"{sum(seconds) / 60:.1f}"))
     return "\n".join(rows)
 
 
@@ -69,17 +81,18 @@ def _versions(found: Cells) -> str:
 
 
 def _checks(found: Cells, checks: Cells) -> str:
-    """Cells under the scene's noise, and under half of it."""
-    rows = [markdown_row("engine", "timestep [ms]", "noise [cm]", "slope", "E[FoBG]", "verdict"), "|---" * 6 + "|"]
-    for (name, scene, step), half in checks.items():
-        for cell, share in ((found.get((name, scene, step)), 1.0), (half, 0.5)):
-            if cell is not None and "slope" in cell:
-                sigma = 100 * share * SCENES[scene].sigma
-                numbers = (_both(cell, "slope", "slope_by_differences"), _both(cell, "mean", "mean_of_strata"))
-                rows.append(
-                    markdown_row(ENGINES[name].label, f"{1000 * step:g}", f"{sigma:g}", *numbers, verdict(cell))
-                )
-    return "\n".join(rows)
+    """Cells of variants of the toss, each engine's on the matrix's first."""
+    head = ("engine", "timestep [ms]", "from [m]", "noise [cm]", "slope", "E[FoBG]", "verdict")
+    rows = [markdown_row(*head), "|---" * len(head) + "|"]
+    for (name, _, step), cell in checks.items():
+        for each in (found.get((name, "toss", step)), cell):
+            if each is None or "slope" not in each:
+                continue
+            scene = scene_named(each["scene"])
+            numbers = (_both(each, "slope", "slope_by_differences"), _both(each, "mean", "mean_of_strata"))
+            setting = (f"{1000 * step:g}", f"{scene.center:g}", f"{100 * scene.sigma:g}")
+            rows.append(markdown_row(ENGINES[name].label, *setting, *numbers, verdict(each)))
+    return "\n".join(dict.fromkeys(rows))
 
 
 def _reasons(found: Cells) -> str:

@@ -213,7 +213,17 @@ SCENES: Final = {
     ),
     "pendulum": Scene((Body("pendulum", tilt=-0.5, spin=3.0),), "spin", 4.0, 0.3, 0.5, ((1, 0, 0),), floor=False),
 }
+VARIANTS: Final[dict[str, Scene]] = {
+    "toss, half the noise": dataclasses.replace(SCENES["toss"], sigma=SCENES["toss"].sigma / 2),
+    "toss from 0.3 m": dataclasses.replace(SCENES["toss"], center=0.3, sigma=0.05),
+}
+"""Scenes of few engines, beside the matrix."""
 TIMESTEPS: Final = (0.005, 0.002)
+
+
+def scene_named(name: str) -> Scene:
+    """Return a scene of the matrix or a variant."""
+    return {**SCENES, **VARIANTS}[name]
 
 
 def damping_ratio(restitution: float) -> float:

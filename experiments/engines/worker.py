@@ -1,10 +1,9 @@
 """Measure one cell, in the environment of its engine: prints one line of JSON. What is undecided is measured once more,
-on a grid four times as fine. `half`: under half the scene's noise.
+on a grid four times as fine.
 
-python -m experiments.engines.worker ENGINE SCENE TIMESTEP [quick | half]
+python -m experiments.engines.worker ENGINE SCENE TIMESTEP [quick]
 """
 
-import dataclasses
 import json
 import os
 import sys
@@ -12,7 +11,7 @@ from importlib import import_module, metadata
 
 from experiments.engines.catalog import ENGINES
 from experiments.engines.judge import FEW, MANY, MORE, measure, verdict
-from experiments.engines.scenes import SCENES, CannotError
+from experiments.engines.scenes import CannotError, scene_named
 
 VERSIONED = ("jax", "mujoco", "torch")
 """Packages whose version a cell records."""
@@ -23,9 +22,7 @@ def main() -> None:
     # Before JAX is imported: models put on the device earlier would be float32, whose differences mislead.
     os.environ["JAX_ENABLE_X64"] = "1"
     name, where, timestep, *how = sys.argv[1:]
-    engine, scene = ENGINES[name], SCENES[where]
-    if "half" in how:
-        scene = dataclasses.replace(scene, sigma=scene.sigma / 2)
+    engine, scene = ENGINES[name], scene_named(where)
     counts = FEW if "quick" in how or engine.slow else MANY
     try:
         build = import_module(f"experiments.engines.adapters.{engine.adapter}").build
