@@ -98,3 +98,13 @@ def test_a_diagnosis_of_an_own_task_builds_nothing_twice(tmp_path: Path) -> None
     ]
     assert len(large) == len(set(large)) and {"value", "gradient", "corrected", "derivatives_of_a_step"} <= set(large)
     assert again["built"] == []
+
+
+@pytest.mark.slow
+def test_no_command_on_an_own_task_builds_anything_again(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("from tests.carts import cart\n")
+    commands = ["sweep mine:cart --contact mjcf --samples 20 --output", "rollout mine:cart --output"]
+    twice = [f"{command} {name}{place}" for place, command in enumerate(commands) for name in "ab"]
+    twice += [command for command in ("gradcheck mine:cart", "bench mine:cart --samples 50") for _ in range(2)]
+    found = builds_of(tmp_path, *twice)
+    assert all(first["built"] and not again["built"] for first, again in zip(found[::2], found[1::2], strict=True))
