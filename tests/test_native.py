@@ -11,10 +11,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from jax import lax
+from mujoco import mjx
 
+import mjx_study
 from mjx_study import runtime
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.graph import build, c, cuda, native, random
@@ -384,3 +387,26 @@ def test_steps_and_their_derivatives(monkeypatch, name):
         found.append(jax.tree.leaves(jax.jit(jax.vmap(jax.value_and_grad(total, has_aux=True)))(controls)))
     for ours, theirs in zip(*found, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * np.max(np.abs(theirs), initial=1e-300))
+
+
+def test_a_model_that_limits_its_contacts_is_native():
+    """With `max_contact_points`, MJX keeps the deepest contacts: here two corners of a tilted box of four."""
+    host = mujoco.MjModel.from_xml_string("""
+        <mujoco><option iterations="50" ls_iterations="20" tolerance="1e-14"/>
+          <custom><numeric name="max_contact_points" data="2"/></custom>
+          <worldbody><geom type="plane" size="1 1 1"/>
+            <body pos="0 0 0.099"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="1"/></body>
+          </worldbody></mujoco>""")
+    model, data = mjx.put_model(host), mjx.make_data(host)
+    rows: Any = data._impl
+    assert rows.contact.dist.shape == (2,)
+    before = native._LEFT.copy()
+
+    def height(tilt, advance):
+        start = data.replace(qpos=data.qpos.at[4:6].set(tilt))
+        return jax.lax.fori_loop(0, 3, lambda _, each: advance(model, each), start).qpos
+
+    tilts = 0.004 * jnp.arange(-3.5, 4)[:, None] * jnp.array([1.0, 0.3])
+    ours, stock = (jax.jit(jax.vmap(partial(height, advance=each)))(tilts) for each in (mjx_study.step, mjx.step))
+    np.testing.assert_allclose(ours, stock, rtol=0, atol=1e-9)
+    assert native._LEFT == before
