@@ -68,7 +68,7 @@ def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
         tmp_path,
         compare,
         compare,
-        f"{compare} --samples 30 --seed 1",
+        f"{compare} --samples 30 --seed 1 --chunk-size 60",
         "landscape mine:cart --samples 20 --points 3",
         optimise,
         optimise,

@@ -41,8 +41,7 @@ from mjx_study.experiment.memory import check_memory, padded_seeds
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
-from mjx_study.graph.native import computes_steps
-from mjx_study.objective import Simulator, TracedObjective, chunk_for, simulate
+from mjx_study.objective import Simulator, TracedObjective, chunk_for, natively, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.reference import Reference
@@ -187,7 +186,7 @@ class Backend:
         self.optimizer = make_optimizer(config.settings.optimizer, *map(float, self._rates))
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
         evaluation = chunk_for(config.settings.evaluation_samples, local_devices(), [self.task])
-        chunk = plan.chunk_size if config.chunk_size else evaluation
+        chunk = plan.chunk_size if config.chunk_size and not self._in_turn else evaluation
         self._evaluation = self.simulator and Simulator(self.task, chunk_size=chunk)
         self.saving = threading.Lock()
         self.costs: dict[str, tuple[int, float]] = {}  # iterations and last cost by estimator
@@ -211,8 +210,7 @@ class Backend:
     def _in_turn(self) -> bool:
         """Whether a program takes seeds in turn, so that it serves any number of them and of samples, up to a size:
         where rollouts are native code, which gains nothing from larger batches."""
-        on_host = jax.default_backend() == "cpu" and computes_steps() == "native"
-        return self.simulator is not None and on_host and self.task.scene.uses_graph
+        return self.simulator is not None and natively([self.task])
 
     def place(self, state: Descent, index: int) -> Descent:
         """Put the state of an estimator on its device; on CPUs always the first, see `spread`."""

@@ -15,7 +15,7 @@ from mjx_study.experiment.resolution import at_theta
 from mjx_study.experiment.study import Group, StudyCell, StudyKind, StudyPlan, estimators_of
 from mjx_study.experiment.unused_options import reject_unused_options
 from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
-from mjx_study.objective import chunk_for
+from mjx_study.objective import chunk_for, natively
 from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS, SAMPLES, NamedTask, StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.results.kind import find_kind
@@ -81,7 +81,9 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
     most = max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * kind.batches_at_once(config)
     tasks = [group.task for group in groups]
     most = min(LARGEST_BATCH[jax.default_backend()], most)
-    size = config.chunk_size or chunk_for(most, local_devices(), tasks, own_program=kind.one_program)
+    size = config.chunk_size
+    if size is None or natively(tasks):  # native code has few sizes, so that no other builds another program
+        size = chunk_for(size or most, local_devices(), tasks, own_program=kind.one_program)
     plan = StudyPlan(config, tuple(groups), tuple(cells), size, tuple(dict.fromkeys(messages)))
     kind.check_memory(plan)
     for cell in {cell.group: cell for cell in cells}.values():

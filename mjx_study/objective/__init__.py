@@ -15,11 +15,11 @@ from mjx_study.objective.batches import (
     compiled_rollout,
     contact_for,
 )
-from mjx_study.objective.chunks import MAX_CHUNK, chunk_for, spread
+from mjx_study.objective.chunks import MAX_CHUNK, chunk_for, natively, spread
 from mjx_study.objective.cost import rollout_cost, simulate
 from mjx_study.objective.programs import SamplePrograms
 
 __all__ = [
     "BlankObjective", "MAX_CHUNK", "MjxObjective", "SamplePrograms", "Simulator", "TracedObjective", "chunk_for",
-    "compiled_rollout", "contact_for", "rollout_cost", "simulate", "spread",
+    "compiled_rollout", "contact_for", "natively", "rollout_cost", "simulate", "spread",
 ]  # fmt: skip

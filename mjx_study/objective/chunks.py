@@ -87,7 +87,7 @@ def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), 
         few, some, most = CPU_CHUNKS
         if in_numpy() and samples > some // 2:
             return IN_NUMPY
-        if own_program and computes_steps() == "native" and all(task.scene.uses_graph for task in tasks):
+        if own_program and natively(tasks):
             return IN_TURN[samples >= IN_TURN[0]]
         if own_program:
             return min(samples + 1, most)
@@ -96,6 +96,11 @@ def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), 
     memory = (devices[0].memory_stats() or {}).get("bytes_limit", math.inf)
     most = max(1, int(min(MAX_CHUNK[platform], MAX_SHARE * memory / max(map(_gradient_bytes, tasks), default=1))))
     return math.ceil(each / math.ceil(each / most))
+
+
+def natively(tasks: Sequence[Task]) -> bool:
+    """Whether JAX's default backend is a CPU that runs the tasks as native code, whatever the size of a chunk."""
+    return jax.default_backend() == "cpu" and computes_steps() == "native" and all(t.scene.uses_graph for t in tasks)
 
 
 def _gradient_bytes(task: Task) -> int:
