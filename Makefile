@@ -53,7 +53,7 @@ bench-first: $(STAMP) ## Measure how long first answers take, into docs/performa
 coverage: $(STAMP) ## Measure the tables of docs/coverage.md (a few minutes)
 	$(BIN)/python -m experiments.coverage
 
-engines: $(STAMP) ## Measure what docs/engines.md lacks, in pinned environments (hours; resumable; QUICK=1 for a trial)
+engines: $(STAMP) ## Measure what docs/engines.md lacks, in pinned environments (hours; resumable; QUICK=1: a scene, in minutes)
 	-$(BIN)/python -m experiments.engines.install
 	$(BIN)/python -m experiments.engines $(if $(QUICK),--quick)
 	$(if $(QUICK),,$(BIN)/python -m experiments.engines page && $(BIN)/python -m experiments.engines.figure)

@@ -34,6 +34,8 @@ LIMIT = 900
 """Seconds that a cell may take."""
 ONE_CORE: Final = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
 """Of cells of which several are measured at a time."""
+TRIAL: Final = ("toss",)
+"""Scenes of `--quick`."""
 HALF, HIGH = VARIANTS
 CHECKED: Final = (
     *itertools.product(("mjx", "brax_positional", "drake_sap"), (HALF,), TIMESTEPS),
@@ -54,7 +56,8 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
             print(f"{name}: not installed, skipped: python -m experiments.engines.install {ENGINES[name].environment}")
             continue
         steps = arguments.timestep or TIMESTEPS[: 1 if arguments.quick else None]
-        every = CHECKED if arguments.what == "check" else itertools.product((name,), arguments.scene or SCENES, steps)
+        scenes = arguments.scene or (TRIAL if arguments.quick else SCENES)
+        every = CHECKED if arguments.what == "check" else itertools.product((name,), scenes, steps)
         todo += [(python, *key[:2], str(key[2])) for key in every if key[0] == name and key not in found]
     writing, cores = Lock(), SimpleQueue()
     pin = arguments.jobs > 1 and shutil.which("taskset") is not None
@@ -103,7 +106,7 @@ def main() -> None:
     parser.add_argument("what", nargs="?", choices=("measure", "check", "page", "merge"), default="measure")
     parser.add_argument("files", nargs="*", type=Path, help="of merge")
     parser.add_argument(
-        "--quick", action="store_true", help="a quarter of the rollouts, one timestep, apart from the data"
+        "--quick", action="store_true", help="a scene at a timestep, a quarter of the rollouts, apart from the data"
     )
     parser.add_argument("--only", nargs="+", choices=tuple(ENGINES), help="these engines", metavar="ENGINE")
     parser.add_argument("--scene", nargs="+", choices=tuple(SCENES), help="these scenes", metavar="SCENE")
