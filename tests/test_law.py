@@ -29,6 +29,7 @@ from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.law import LAWS, MujodicoLaw
 from mjx_study.simulation.scene import Scene, put_scene
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import single_contact
 
 BALL = """<mujoco><option timestep="0.002" cone="{}"/><worldbody><geom name="floor" type="plane" size="5 5 1"/>
   <body pos="0 0 0.1"><freejoint/><geom name="ball" size="0.1" mass="1"/></body></worldbody></mujoco>"""
@@ -198,8 +199,8 @@ def test_the_graph_has_the_packages_own_derivative(law: str, monkeypatch: pytest
 
 @pytest.mark.slow
 def test_bench_leaves_out_rivals_of_another_law() -> None:
-    defaults = study.StudyDefaults(stiffnesses=(100.0,), families=("hunt_crossley",))
-    report = run_bench(make_task("pusher", horizon=3).replace(defaults=defaults), 6)
+    task = make_task("pusher", horizon=3)
+    report = run_bench(task, 6, contact=single_contact(task, "hunt_crossley", 100.0)[0])
     assert report.contact.startswith("hunt_crossley")
     assert set(report.ratios) == {"gradient_per_value", "onset_per_gradient"}
     assert any("left out" in line for line in report.lines())

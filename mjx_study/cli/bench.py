@@ -4,7 +4,7 @@ import argparse
 
 from mjx_study.cli.options import configure_process, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
-from mjx_study.options.parser import Parser
+from mjx_study.options.parser import MIDDLE, Parser
 
 EPILOG = """\
 Measures rollouts and gradients per second in a single run on this machine, and compares them with jax.grad through
@@ -15,6 +15,7 @@ and an adjoint, on the same number of threads.
 
 def add(command: Parser) -> None:
     command.add_task_options()
+    command.add_contact_options(MIDDLE, many=False, analytic=False)
     command.add_option(
         "samples", many=False, interval="[1, 1e7]", default=1000, line="samples in the batch that is timed"
     )
@@ -22,11 +23,14 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from mjx_study.bench import check_bench, run_bench
+    from mjx_study.tasks.contact_grid import single_contact
 
     with usage_errors():
         configure_process(options)
         task = task_of(options)
-        check_bench(task, options.samples)
+        given = options.contact, options.stiffness, options.damping, options.smoothing
+        contact, _ = single_contact(task, *given)
+        check_bench(task, options.samples, contact)
     with computing() as progress:
-        report = run_bench(task, options.samples, progress)
+        report = run_bench(task, options.samples, progress, contact)
     return print_report(options, report.as_json(), report.lines())
