@@ -319,3 +319,11 @@ def test_the_descent_costs_little_beside_its_rollouts() -> None:
     ]
     one, ten = np.min(seconds, axis=0)
     assert ten < 0.5 * 10 * one, seconds
+
+
+def test_a_descent_that_ends_above_its_start_is_reported() -> None:
+    """Steps that are far too long, and short ones."""
+    for rate, above in ((1.0, True), (1e-4, False)):
+        study = config(estimators=("zobg", "fobg"), learning_rate=rate, iterations=3, contact=("reference",))
+        found = findings_of(run_study(study))
+        assert [each for each in found if "ZoBG, FoBG end above the start" in each] == (found[:1] if above else [])

@@ -86,7 +86,8 @@ def plan_gradcheck(
     if families is None:
         families = ("mjcf",) if task.contact_pair is None else CONTACT
     own = task.defaults.stiffnesses
-    usual = STIFFNESS if min(STIFFNESS) <= max(own) else own
+    overlap = min(STIFFNESS) <= max(own) and min(own) <= max(STIFFNESS)
+    usual = STIFFNESS if overlap else own
     cells, messages = family_grid(task, families, usual if stiffnesses is None else stiffnesses, damping, smoothing)
     if not cells:
         raise ValueError("no contact model to check: give at least one stiffness and one contact family")

@@ -155,7 +155,7 @@ class StudyConfig:
         "pairs of rollouts for each reference",
         "[3, 1e7]",
         study="gradients",
-        unset="600 or more, until its uncertainty is 5 %",
+        unset="600 to 19,200, until its uncertainty is 5 %",
     )
     evaluation_samples: int | None = declared(
         None, "N", "rollouts for the cost of a final policy", "[2, 1e7]", study="descents", unset="200"

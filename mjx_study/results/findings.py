@@ -34,6 +34,7 @@ BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not significantly differe
 UNKNOWN: Final = "undecided (too few effective samples)"
 """Verdicts on FoBG's variance."""
 BOUND: Final = "its bound gamma is below epsilon, the radius of ZoBG's mean; increase --gamma or --samples"
+ABOVE_START: Final = "use a lower --learning-rate, or check by diagnose whether the mean is right"
 WEIGHTLESS: Final = (
     "alpha is 0 in every iteration, usually because its bound gamma is below epsilon, the radius of ZoBG's mean (then "
     "increase --gamma or --samples), else since no first-order variance is finite"
@@ -54,20 +55,32 @@ def gradient_findings(dataset: xr.Dataset) -> list[str]:
 
 
 def descent_findings(dataset: xr.Dataset) -> list[str]:
-    """Report where the first-order batch of an AoBG with a bound has no weight in any iteration of any seed."""
-    if "alpha" not in dataset:
-        return []
-    gammas, along = gammas_of(dataset), ("iteration", "seed")
-    stuck = (dataset["alpha"].max(along) == 0).stack(place=(*SETTING, "model", "estimator"))
-    names = (*SETTING, "contact", "stiffness", "estimator")
-    rows = [Row(**{name: one[name].item() for name in names}) for one in stuck[stuck.values]]
-    bound = [row for row in rows if gammas.get((row.task, row.estimator), math.inf) < math.inf]
+    """Report descents that end above their start, and where the first-order batch of an AoBG with a bound has no weight
+    in any iteration of any seed."""
 
-    def of(rows: Sequence[Row]) -> list[str]:
+    def places(where: xr.DataArray) -> list[Row]:
+        names = (*SETTING, "contact", "stiffness", "estimator")
+        stacked = where.stack(place=(*SETTING, "model", "estimator"))
+        return [Row(**{name: one[name].item() for name in names}) for one in stacked[stacked.values]]
+
+    def ended_above(rows: Sequence[Row]) -> list[str]:
+        labels = dict.fromkeys(label_in(dataset, row.estimator) for row in rows)
+        verb = "ends" if len(labels) == 1 else "end"
+        return [f"{', '.join(labels)} {verb} above the start{_at(rows)}: {ABOVE_START}"]
+
+    def weightless(rows: Sequence[Row]) -> list[str]:
         groups = [(label_in(dataset, name), same) for (name,), same in _by(rows, "estimator").items()]
         return [f"{label} equals ZoBG throughout{_at(same)}: {WEIGHTLESS}" for label, same in groups]
 
-    return _by_family(dataset, bound, of)
+    gammas, found = gammas_of(dataset), []
+    error = np.hypot(dataset["final_cost_se"].max("seed"), dataset["start_cost_se"])
+    above = dataset["final_cost"].mean("seed") - dataset["start_cost"] > OFF_SE * error
+    found += _by_family(dataset, places(above), ended_above)
+    if "alpha" in dataset:
+        stuck = places(dataset["alpha"].max(("iteration", "seed")) == 0)
+        bound = [row for row in stuck if gammas.get((row.task, row.estimator), math.inf) < math.inf]
+        found += _by_family(dataset, bound, weightless)
+    return found
 
 
 def _by_family(dataset: xr.Dataset, rows: Iterable[Row], of: Callable[[list[Row]], list[str]]) -> list[str]:
