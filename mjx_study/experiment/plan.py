@@ -82,8 +82,8 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
     tasks = [group.task for group in groups]
     most = min(LARGEST_BATCH[jax.default_backend()], most)
     size = config.chunk_size
-    if size is None or natively(tasks):  # native code has few sizes, so that no other builds another program
-        size = chunk_for(size or most, local_devices(), tasks, own_program=kind.one_program)
+    if size is None or natively(tasks):  # native code gains nothing from others, which would be built
+        size = chunk_for(most, local_devices(), tasks, own_program=kind.one_program)
     plan = StudyPlan(config, tuple(groups), tuple(cells), size, tuple(dict.fromkeys(messages)))
     kind.check_memory(plan)
     for cell in {cell.group: cell for cell in cells}.values():
