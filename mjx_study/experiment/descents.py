@@ -223,10 +223,6 @@ class Backend:
         self, estimator: Estimator, model: ContactPoint
     ) -> Callable[[Descent, Key[Array, " seeds"], int], tuple[Descent, Record]]:
         """Return an iteration of all seeds under one contact model, by index; compiled once for all contact models."""
-
-        def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
-            return advance(state, drawn, estimator, self.optimizer)
-
         if (simulator := self.simulator) is not None:
             if estimator not in self._iterations:
                 name, size = self.config.settings.optimizer, self._padded if self._in_turn else self.samples
@@ -250,6 +246,10 @@ class Backend:
                 self._iterations[estimator] = Compiled(in_turn if self._in_turn else all_seeds, *made_of)
             simulated = self._iterations[estimator]
             return lambda *arguments: simulated(*self._on_device(model, *arguments))
+
+        def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
+            return advance(state, drawn, estimator, self.optimizer)
+
         compiled = self._iterations.setdefault(estimator, jax.jit(update))
         count = max(1, TOGETHER // self.samples)
 

@@ -273,9 +273,11 @@ class TracedObjective(MjxObjective):
         dtype = simulator.task.scene.template.qpos.dtype
         scale = np.ones(len(rows), dtype) if noise_scale is None else np.asarray(noise_scale, dtype)
         chunk = simulator.chunk_size
-        order = np.argsort(rows, stable=True)  # so that few chunks hold all rows of the first samples
-        at = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1)
-        chunks, back = order[at].reshape(-1, chunk), np.argsort(order)
+        chunks = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1).reshape(-1, chunk)
+        back: Any = slice(len(rows))
+        if self.samples is not None:  # few chunks are to hold all rows of the first samples
+            order = np.argsort(rows, stable=True)
+            chunks, back = order[chunks], np.argsort(order)
         key_data, sigma = jax.random.key_data(keys), jnp.asarray(self.sigma, dtype)
         kept = simulator._programs[name]
         blank = simulator._chunk(theta, None, 1.0)[-2:]

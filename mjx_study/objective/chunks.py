@@ -78,9 +78,8 @@ def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), 
 
     On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the middle one for up to `MANY`; for a program of such
     batches alone, one of `IN_TURN`, or, through XLA, all that the largest holds; `IN_NUMPY` for half of the middle one
-    or more. On accelerators, the size
-    that needs the fewest calls (at least one per device), evenly filled, with at most as many samples as task gradients
-    fit into `MAX_SHARE` of the memory.
+    or more. On accelerators, the size that needs the fewest calls (at least one per device), evenly filled, with at
+    most as many samples as task gradients fit into `MAX_SHARE` of the memory.
     """
     platform = devices[0].platform
     if platform == "cpu":
