@@ -197,6 +197,26 @@ def test_the_graph_has_the_packages_own_derivative(law: str, monkeypatch: pytest
     assert len(graphs) == 1
 
 
+def test_diagnose_judges_means_under_every_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What begins, and how much its step varies, hardly depend on the law: the ball flies freely until then."""
+    printed, found, pages = [], {}, {}
+    monkeypatch.setattr("mjx_study.cli.diagnose.print_report", lambda _, *given: printed.append(given))
+    for law in ("mujoco", "hunt_crossley", "log_barrier"):
+        options = ["--contact", law, "--samples", "60", "--horizon", "240"]
+        assert cli.main(["diagnose", "momentum_transfer", *options]) == 0
+        found[law], pages[law] = printed[-1][0], "\n".join(printed[-1][1])
+    means = {law: {each["estimator"]: each["mean"] for each in of["estimators"]} for law, of in found.items()}
+    assert means["mujoco"]["fobg"] == "biased" and "h^2 k" in pages["mujoco"]
+    for law, lead in (("hunt_crossley", 0.004), ("log_barrier", 0.002 + 0.95 * 0.04)):
+        assert means[law] == {"zobg": "unbiased", "fobg": "right", "aobg": "right"}
+        assert found[law]["derivatives"] == "right" and found[law]["onsets"] == found["mujoco"]["onsets"] == 60
+        assert found[law]["onset_spread"] == pytest.approx(found["mujoco"]["onset_spread"], rel=0.4)
+        (touch,) = found[law]["touches"]
+        assert 0 <= lead * touch["speed"] - touch["distance"] < 1.5 * 0.002 * touch["speed"]
+        assert f"{law} is not MuJoCo's law" in pages[law] and "take fobg" in pages[law]
+        assert not any(each in pages[law] for each in ("_onset", "--onset", "h^2 k", "solimp", " biased"))
+
+
 @pytest.mark.slow
 def test_bench_leaves_out_rivals_of_another_law() -> None:
     task = make_task("pusher", horizon=3)
@@ -210,7 +230,7 @@ def test_bench_leaves_out_rivals_of_another_law() -> None:
     ("command", "message"),
     [
         ("gradcheck pusher --contact conic --stock", "--stock is for MuJoCo's law, which conic does not have"),
-        ("diagnose pusher --contact conic", "--contact describes contacts in the terms of MuJoCo's law"),
+        ("diagnose pusher --contact conic --smoothing 0", "conic needs a smoothing above 0"),
         ("rollout pusher --contact mujoco --smoothing 1e-5", "--smoothing has no effect on MuJoCo's law"),
         ("sweep pusher --contact conic --onset linear --dry-run", "--onset is for MuJoCo's law"),
         ("sweep pusher --contact mujoco,conic --estimators fobg_onset --dry-run", "corrects MuJoCo's law, not conic"),
