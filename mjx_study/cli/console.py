@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import shlex
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -246,6 +247,10 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         for stop in run["stopped"]:
             label = label_of(run["estimator"], onset)
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
+    if paths := document.get("policies"):
+        least = [np.nanmin(_finite(run["final_cost"]), initial=np.inf) for run in document["runs"]]
+        best = shlex.join(["mjx-study", "rollout", config["task"], "--theta", paths[int(np.argmin(least))]])
+        lines.append(f"to see the best policy: {best}")
     return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
