@@ -58,6 +58,5 @@ def run(options: argparse.Namespace) -> int:
         lines.append("nothing touched in its test rollouts: there is no contact to study unless start or goal move")
     if written:
         here = "" if mjcf.parent == Path() else f"cd {shlex.quote(str(mjcf.parent))} && "
-        also = ", ".join(("rollout", "diagnose", "optimise"))
-        lines += [f"next: {here}mjx-study compare {place}", f"or one of: {also} {place}"]
+        lines.append(f"next: {here}mjx-study compare {place} (or rollout, diagnose, optimise)")
     return print_report(options, document, lines, unwritten)
