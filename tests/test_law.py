@@ -69,6 +69,17 @@ def test_a_static_load_measures_the_stiffness(law: str, cone: str) -> None:
     assert WEIGHT / (0.1 - float(last.qpos[2])) == pytest.approx(stiffness, rel=0.01)
 
 
+@pytest.mark.parametrize("law", ["log_barrier", "conic"])
+def test_a_barrier_floats_in_proportion_to_its_smoothing(law: str) -> None:
+    """Both laws, at the same kappa: four edges share the weight's impulse, each kappa over phi / (h + tau)."""
+    scene, kappa, tau = ball(), 1e-4, 2 * 0.95 * 0.02
+    contact = family_model(law, scene, effective_mass=1.0, smoothing=kappa)
+    advance = partial(step, scene, apply_contact(scene.model, contact), control=jnp.zeros(0))
+    start = study.initial_state(scene)
+    last = jax.jit(lambda state: jax.lax.fori_loop(0, 2000, lambda _, at: advance(state=at)[0], state))(start)
+    assert float(last.qpos[2]) - 0.1 == pytest.approx(4 * kappa * (0.002 + tau) / (0.002 * WEIGHT), rel=1e-3)
+
+
 @pytest.mark.parametrize("law", list(LAWS))
 def test_derivatives_are_those_of_differences_in_both_modes(law: str) -> None:
     scene = ball()
