@@ -3,9 +3,11 @@
 import builtins
 import dataclasses
 import json
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -17,7 +19,7 @@ import pytest
 import mjx_study as study
 from mjx_study import cli
 from mjx_study.bench import run_bench
-from mjx_study.choices import laws_of
+from mjx_study.choices import FAMILIES, laws_of
 from mjx_study.execution.run import run_study
 from mjx_study.graph import scalars
 from mjx_study.graph.native import SWITCH
@@ -255,6 +257,38 @@ def test_what_is_only_for_mujocos_law_is_refused(
     printed = capsys.readouterr().err
     said = [line for line in printed.splitlines() if line.startswith("mjx-study: ")]
     assert len(said) == 1 and message in said[0], printed
+
+
+DROP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="1 1 .1" condim="1"/>
+  <body><joint type="slide" axis="0 0 1"/><geom name="ball" size=".1" mass="1" condim="1"/></body></worldbody>
+  <keyframe><key qpos="0.11" qvel="-1"/></keyframe></mujoco>"""
+
+
+def test_a_law_of_ones_own_is_one_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """That of the page: it bears a load by its stiffness, commands and studies take it, and its derivative is right."""
+    for table in (LAWS, FAMILIES):
+        monkeypatch.setitem(table, "spring", None)  # restored at the end
+    page = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
+    code = page.partition("## A contact law of your own")[2].partition("```python\n")[2].partition("```")[0]
+    monkeypatch.setitem(sys.modules, "spring", own := ModuleType("spring"))
+    exec(code, vars(own))
+    scene = put_scene(mujoco.MjModel.from_xml_string(DROP), "drop")
+    pressed = study.initial_state(scene, jnp.array([0.1 - WEIGHT / 3000]))
+    moved, _ = stepping(scene, "spring", 3000.0)(state=pressed)
+    assert abs(float(moved.qvel[0])) < 1e-3 * 0.002 * WEIGHT
+    path = tmp_path / "drop.xml"
+    path.write_text(DROP)
+    spring = ["--contact", "spring", "--stiffness", "3000"]
+    assert cli.main(["gradcheck", str(path), *spring, "--pair", "floor,ball", "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["steps"]
+    assert found["verdict"] == "right" and found["coverage"]["counts"]["push"]
+    with pytest.raises(ValueError, match="spring does not support more than a height"):
+        single_contact(make_task("pusher"), "spring", 3000.0)
+    task = make_task(str(path), horizon=60).replace(contact_pair=PAIR, sigma=0.1)
+    about = StudyConfig(tasks=(task,), contact=("spring",), stiffness=(3000.0,), samples=(50,), estimators=("fobg",))
+    assert float(run_study(about)["relative_error"].squeeze()) < 0.1
 
 
 def test_forces_and_onsets_of_mujocos_law_are_refused() -> None:

@@ -6,8 +6,8 @@ than a pydantic model, since the parser needs them and pydantic alone would add 
 
 import dataclasses
 import itertools
-from collections import Counter
-from collections.abc import Mapping
+from collections import ChainMap, Counter
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, Final, Protocol, Union, runtime_checkable
 
 from estimators.choices import DENSITIES
@@ -20,8 +20,8 @@ from mjx_study.options.rules import check_span, reject_untaken
 if TYPE_CHECKING:
     import estimators.estimator
 
-CONTACTS: Final = (*FAMILIES, REFERENCE)
-"""Contact families of a study, and the analytic reference."""
+CONTACTS: Final[Collection[str]] = ChainMap[str, Any]({REFERENCE: None}, FAMILIES)
+"""Contact families of a study, those added later included, and the analytic reference."""
 UNSET_TASK: Final = "the task's"
 UNSET_MJCF: Final = "the MJCF's"
 DEFAULT_KIND: Final = "gradients"

@@ -123,7 +123,7 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         """Add the contact models: one or many, with or without the analytic reference."""
         self.add_option("stiffness", many=many, unset=stiffness)
-        self.add_option("contact", many=many, unset=contact, choices=CONTACTS if analytic else tuple(FAMILIES))
+        self.add_option("contact", many=many, unset=contact, choices=CONTACTS if analytic else FAMILIES)
         self.add_options("damping", "smoothing")
 
     def add_estimator_options(self) -> None:
