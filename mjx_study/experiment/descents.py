@@ -88,7 +88,7 @@ class Descents(StudyKind):
     def check(self, plan: StudyPlan, cell: StudyCell) -> None:
         config, group, chosen = plan.config, plan.groups[cell.group], estimators_of(plan, cell)
         recipe = group.descent
-        make_optimizer(plan.settings.optimizer, recipe.learning_rate, recipe.decay)
+        make_optimizer(recipe.optimizer, recipe.learning_rate, recipe.decay)
         schedule_factors(config.sigma_schedule, recipe.iterations)
         schedule_factors(config.stiffness_schedule, recipe.iterations, most=1.0)
         if config.stiffness_schedule and any(
@@ -183,7 +183,7 @@ class Backend:
         self.task, self.recipe, self.samples = group.task.replace(sigma=cell.sigma), group.descent, cell.samples
         self.config, self.seeds = config, config.seeds
         self._rates = np.array(self.recipe.learning_rate), np.array(self.recipe.decay)
-        self.optimizer = make_optimizer(config.settings.optimizer, *map(float, self._rates))
+        self.optimizer = make_optimizer(self.recipe.optimizer, *map(float, self._rates))
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
         evaluation = chunk_for(config.settings.evaluation_samples, local_devices(), [self.task])
         chunk = plan.chunk_size if config.chunk_size and not self._in_turn else evaluation
@@ -225,7 +225,7 @@ class Backend:
         """Return an iteration of all seeds under one contact model, by index; compiled once for all contact models."""
         if (simulator := self.simulator) is not None:
             if estimator not in self._iterations:
-                name, size = self.config.settings.optimizer, self._padded if self._in_turn else self.samples
+                name, size = self.recipe.optimizer, self._padded if self._in_turn else self.samples
 
                 def in_turn(contact, sigma, state: Descent, keys, rates, samples):
                     objective = TracedObjective(simulator, contact, sigma, batched=False, samples=samples)
