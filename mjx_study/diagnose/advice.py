@@ -105,7 +105,13 @@ def _onset(found: Diagnosis) -> Iterator[Advice]:
     by_name, timestep = {each.estimator: each for each in found.estimators}, found.task.scene.timestep
     plain, corrected = by_name["fobg"], by_name["fobg_onset"]
     spread, strength = found.onsets["onset_spread"], found.onsets["onset_strength"]
-    linear = ERROR_PER_STRENGTH * strength
+    linear, left_out = ERROR_PER_STRENGTH * strength, found.onsets["onsets_missed"] / found.onsets["onsets"]
+    if corrected.verdict != "right" and left_out > NOTABLE_SHARE:
+        yield (
+            f"{percent(left_out)} of the contacts have no onset term, since they chatter or are too many, and keep "
+            "their bias: a shorter --horizon, more damping of the contact or a smaller --timestep has fewer of them",
+            "",
+        )
     if corrected.verdict == "right":
         if spread < LEAST_SPREAD:
             yield (

@@ -21,7 +21,7 @@ TERM: Final = "; _onset: with a term for contact that begins or ends"
 MAX_ERROR: Final = 100.0
 """Upper end beyond which the interval of a relative error is uninformative."""
 MAX_SHOWN: Final = 6
-"""Number of contacts listed in the text, least resolved first."""
+"""Number of contacts listed in the text, the least resolved ones."""
 
 
 def document_of(found: Diagnosis) -> dict[str, Any]:
@@ -109,7 +109,10 @@ def _contact_lines(found: Diagnosis) -> list[str]:
         if "onset_strength" in found.onsets:
             share = percent(found.onsets["onset_strength"])
             lines.append(f"  approach speed that a contact takes in its first step: {share}")
-        for name, what in (("missed", "for lack of slots"), ("replaced", "since corners or edges replace others")):
+        for name, what in (
+            ("missed", "since they chatter or exceed its slots"),
+            ("replaced", "since corners or edges replace others"),
+        ):
             if count := found.onsets.get(f"onsets_{name}", 0):
                 lines.append(f"  contacts per rollout without an onset term {what}: {count / found.samples:.2g}")
     if not found.touches:
@@ -119,7 +122,10 @@ def _contact_lines(found: Diagnosis) -> list[str]:
     more = len(worst) - MAX_SHOWN
     return [
         *lines,
-        *tabulate(worst[:MAX_SHOWN], [pair, *TOUCHES, *([DISTANCE] if found.law else CONTACTS)]),
+        *tabulate(
+            sorted(worst[:MAX_SHOWN], key=lambda each: each.time),
+            [pair, *TOUCHES, *([DISTANCE] if found.law else CONTACTS)],
+        ),
         *([f"  and {more} more"] if more > 0 else []),
     ]
 
