@@ -42,6 +42,7 @@ from experiments.laws.page import (
     CHECKS,
     CORNER,
     LAWS,
+    LONGER,
     PYRAMIDAL,
     RIGID,
     TOSSES,
@@ -68,6 +69,8 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
         for row, each in LAWS.items():
             found[f"train {name}", row] = partial(trained, name, *each, "fobg")
         found[f"train {name}", ZEROTH] = partial(trained, name, *LAWS["MuJoCo's default"], "zobg")
+        for row, longer in LONGER.items():
+            found[f"train {name}", row] = partial(trained, name, *longer)
         for row, each in LAWS.items() if name == "ball_wall" else ():
             found["pusher", row] = partial(sampled, "pusher", *each)
     for row, scale in itertools.product(("log_barrier", "hunt_crossley"), (0.1, 10.0)):

@@ -50,7 +50,7 @@ SLOPE: Final = 0.5
 STEPS: Final = (0.001, 0.002, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08)
 STIFF, SHORT = (0.001, 1.0), 1e-4  # solref and [s] of `RIGID`
 SAMPLED: Final = ("pusher", "tennis", "landing")
-TRAINED: Final = {
+TRAINED: Final[dict[str, dict[str, Any]]] = {
     "pusher": {"iterations": 200, "samples": (10,)},
     "ball_wall": {"iterations": 40, "samples": (30,), "learning_rate": 1.0},
 }
@@ -224,10 +224,11 @@ def bodies(family: str) -> dict[str, Any]:
     }
 
 
-def trained(name: str, family: str, onset: str, estimator: str) -> dict[str, Any]:
-    """Costs of the policies that descents reach under a law, and of the same in the C engine with MuJoCo's default."""
+def trained(name: str, family: str, onset: str, estimator: str, times: int = 1) -> dict[str, Any]:
+    """Costs of the policies that descents reach under a law, and of the same in the C engine with MuJoCo's default;
+    `times` multiplies the iterations."""
     task, of = make_task(name), FAMILIES[family]
-    given: dict[str, Any] = dict(TRAINED[name])
+    given: dict[str, Any] = TRAINED[name] | {"iterations": times * TRAINED[name]["iterations"]}
     if of.swept:
         given["stiffness"] = (stiffness_from_solref(DEFAULT_SOLREF, effective_mass=task.effective_mass)[0],)
         given["damping"] = None if of.dampratio or of.smoothing else task.defaults.damping
