@@ -38,6 +38,7 @@ class Circulation:
         standard_error: Standard error of the gap, [cost].
         quadrature: Quadrature error in excess of the noise, [cost].
         effective: n_eff behind the gap; below `ENOUGH_EFFECTIVE` the standard error means little.
+        largest: Largest size of one sample's gap, [cost].
         num_nonfinite: Samples left out because they are nonfinite somewhere on the path.
     """
 
@@ -46,6 +47,7 @@ class Circulation:
     standard_error: Float[Array, ""]
     quadrature: Float[Array, ""]
     effective: Float[Array, ""]
+    largest: Float[Array, ""]
     num_nonfinite: Int[Array, ""]
 
     @property
@@ -54,11 +56,15 @@ class Circulation:
         return HALF_WIDTH_SE * self.standard_error + self.quadrature
 
     def verdict(self, tolerance: float = TOLERANCE) -> str:
-        """Return "right" (within a share of F's difference), "biased" or "undecided"."""
+        """Return "right" (within a share of F's difference), "biased" or "undecided".
+
+        Few effective samples leave it undecided, unless every sample's gap is within that share.
+        """
         gap, half, within = abs(float(self.gap)), float(self.half_width), tolerance * abs(float(self.difference))
-        if (gap > 0 and not float(self.effective) >= ENOUGH_EFFECTIVE) or float(self.quadrature) > within:
+        few = gap > 0 and not float(self.effective) >= ENOUGH_EFFECTIVE
+        if float(self.quadrature) > within or (few and float(self.largest) > within):
             return "undecided"
-        return "right" if gap + half <= within else "biased" if gap > half else "undecided"
+        return "right" if gap + half <= within else "biased" if gap > half and not few else "undecided"
 
 
 def circulation(
@@ -126,9 +132,10 @@ def circulations(
         gap = weights @ slope - expected
         found = summarise(jnp.stack([gap, expected, apart], axis=1))
         quadrature = jnp.maximum(jnp.abs(found.mean[2]) - 3 * found.standard_error[2], 0.0)
-        count = effective_samples(summarise(jnp.where(jnp.isfinite(apart), gap, jnp.nan)[:, None])).count
+        kept = jnp.where(jnp.isfinite(apart), gap, jnp.nan)
+        count, largest = effective_samples(summarise(kept[:, None])).count, jnp.nanmax(jnp.abs(kept))
         lost = found.num_nonfinite
-        return Circulation(found.mean[1], found.mean[0], found.standard_error[0], quadrature, count, lost)
+        return Circulation(found.mean[1], found.mean[0], found.standard_error[0], quadrature, count, largest, lost)
 
     return [compared(*each) for each in zip(orders, slopes, strict=True)]
 

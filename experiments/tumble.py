@@ -1,7 +1,7 @@
 """Table of docs/in-the-wild.md: gradients on bodies that tumble, through whole rollouts.
 
     pip install playground
-    python -m experiments.tumble    # a quarter of an hour on two cores; to data/tumble.jsonl, and the page
+    python -m experiments.tumble    # twenty minutes on two cores; to data/tumble.jsonl, and the page
     python -m experiments.tumble page
 
 The function is that of `experiments.wild`: the distance forward under a constant action with noise, from the
@@ -34,9 +34,11 @@ from mjx_study.table import markdown_table, number, with_error
 from mjx_study.tasks.policy import NoisyControls
 from mjx_study.tasks.task import Task
 
-NAMES: Final = ("HopperHop", "WalkerRun")
-HORIZONS: Final = (10, 25, MEAN_STEPS)
-"""Steps of the environment."""
+CASES: Final = (
+    *((name, steps, 1) for name in ("HopperHop", "WalkerRun") for steps in (10, 25, MEAN_STEPS)),
+    *(("CheetahRun", MEAN_STEPS, substeps) for substeps in (1, 2, 4)),
+)
+"""Environments, numbers of their steps, and parts into which each timestep of their simulation is divided."""
 SAMPLES: Final = 2000
 PAIRS: Final = 8000
 """Pairs of rollouts behind a slope."""
@@ -74,12 +76,13 @@ class Constant(NoisyControls):
         return jnp.sum(noise_gradient, axis=0)
 
 
-def tumbling(name: str, steps: int) -> Task:
-    """The task of an environment of MuJoCo Playground, of so many of its steps."""
+def tumbling(name: str, steps: int, substeps: int = 1) -> Task:
+    """The task of an environment of MuJoCo Playground, of so many of its steps, each timestep in substeps."""
     playground = environment(name)
     host = copy.copy(playground.mj_model)
     for option, value in CONVERGED.items():
         setattr(host.opt, option, value)
+    host.opt.timestep /= substeps
     scene = put_scene(host, name)
     drawn = jax.random.split(jax.random.key(2), STARTS)
     with mock.patch.object(mjx, "forward", lambda model, data: data):  # only positions are needed
@@ -88,7 +91,8 @@ def tumbling(name: str, steps: int) -> Task:
     def start(key: Key[Array, ""]) -> State:
         return initial_state(scene, pool[jax.random.randint(key, (), 0, STARTS)])
 
-    policy = Constant(steps * playground.n_substeps, host.nu, playground.n_substeps)
+    repeats = substeps * playground.n_substeps
+    policy = Constant(steps * repeats, host.nu, repeats)
     return Task(
         name=name,
         scene=scene,
@@ -102,9 +106,9 @@ def tumbling(name: str, steps: int) -> Task:
     )
 
 
-def measured(name: str, steps: int) -> dict[str, Any]:
+def measured(name: str, steps: int, substeps: int) -> dict[str, Any]:
     """Slope of the mean along the diagonal, and mean and deviation of each gradient."""
-    task = tumbling(name, steps)
+    task = tumbling(name, steps, substeps)
     objective = Simulator(task, chunk_size=201).objective(None)
     keys = lambda: jax.random.split(jax.random.key(0), SAMPLES)  # noqa: E731
     pairs = lambda: jax.random.split(jax.random.key(1), PAIRS)  # noqa: E731
@@ -113,7 +117,12 @@ def measured(name: str, steps: int) -> dict[str, Any]:
     zeroth = zeroth_order(objective.evaluate(task.theta, keys()), "zero_noise").per_sample
     plain = objective.differentiate(task.theta, keys())
     corrected = objective.differentiate_corrected(task.theta, keys())
-    found: dict[str, Any] = {"name": name, "steps": steps, "slope": _mean((above - below) / (2 * REACH))}
+    found: dict[str, Any] = {
+        "name": name,
+        "steps": steps,
+        "substeps": substeps,
+        "slope": _mean((above - below) / (2 * REACH)),
+    }
     for kind, samples in (("zobg", zeroth), ("fobg", plain.gradient), ("fobg_onset", corrected.gradient)):
         array = np.asarray(samples)
         found[kind] = {"mean": _mean(array @ along), "deviation": float(np.sqrt(array.var(axis=0).sum()))}
@@ -134,7 +143,8 @@ def table() -> str:
         means = [with_error(*mean) for mean in (each["slope"], *(kind["mean"] for kind in kinds))]
         deviations = [number(kind["deviation"]) for kind in kinds]
         events = f"{number(each['events'])}, {number(each['missed'])}"
-        lines.append([f"`{each['name']}`, {each['steps']}", *means, ", ".join(deviations), events])
+        divided = f", each timestep in {each['substeps']}" if each["substeps"] > 1 else ""
+        lines.append([f"`{each['name']}`, {each['steps']}{divided}", *means, ", ".join(deviations), events])
     header = ["environment, steps", "slope", "zeroth order", "plain", "with the term", "deviations", "events, without"]
     return markdown_table(lines, header)
 
@@ -144,10 +154,9 @@ def main() -> None:
     if sys.argv[1:] != ["page"]:
         mjx_study.configure()
         RESULTS.write_text("")
-        for name in NAMES:
-            for steps in HORIZONS:
-                with RESULTS.open("a") as file:
-                    print(json.dumps(measured(name, steps)), file=file)
+        for case in CASES:
+            with RESULTS.open("a") as file:
+                print(json.dumps(measured(*case)), file=file)
     write_tables(DOCS / "in-the-wild.md", {"tumble": table()})
 
 

@@ -74,7 +74,7 @@ def programs() -> tuple[dict[Any, Any], dict[Any, Any]]:
 @pytest.fixture(scope="module")
 def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator[None]:
     """Studies that need the same task and chunk size share them with all that is compiled."""
-    from mjx_study.experiment import descents, plan, sampling
+    from mjx_study.experiment import descent_rollouts, plan, sampling
     from mjx_study.options.configuration import BUILDER_OPTIONS
     from mjx_study.runtime import precision  # not above: type checking is switched on after this file is imported
     from mjx_study.tasks import TASKS
@@ -101,7 +101,7 @@ def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "_build", built)
-        for module in (sampling, descents):
+        for module in (sampling, descent_rollouts):
             patch.setattr(module, "Simulator", made)
         yield
 

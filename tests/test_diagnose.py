@@ -238,6 +238,13 @@ def test_biases_without_the_usual_explanation(found: Diagnosis) -> None:
     assert not any("sets in with a jump" in text or "solimp" in text for text in smooth)
 
 
+def test_a_bias_under_another_law_is_laid_to_something_else(found: Diagnosis) -> None:
+    plain = tuple(each for each in found.estimators if not each.estimator.endswith("_onset"))
+    events = {name: found.onsets[name] for name in ("onsets", "onset_spread")}
+    _, text = advised(found, law="conic", onsets=events, estimators=plain, touches=())
+    assert text.startswith("plain first order is biased by") and "something else jumps" in text
+
+
 def test_nothing_is_advised_or_judged_without_a_significant_gradient(found: Diagnosis) -> None:
     """Errors are then absolute; twice the standard error takes four times the samples."""
     unseen = dataclasses.replace(found, estimators=tuple(planted(estimator=name, norm=0.1) for name in ESTIMATORS))

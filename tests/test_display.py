@@ -46,7 +46,10 @@ def test_a_computation_is_never_silent_for_ten_seconds() -> None:
     assert max(later - earlier for earlier, later in zip(times, times[1:], strict=False)) <= SILENCE
     assert watched.shown[1][3] == "computing, 0 of 4" and watched.shown[-1][3] == "cell 2"
     watched.wait(10)
-    assert watched.shown[-1][3] == "computing, 1 of 4, about 284 s left"  # 300 less the 16 since then
+    assert watched.shown[-1][3] == "computing, 1 of 4, at most 284 s left"  # 300 less the 16 since then
+    watched.display.report(2, 4, "cell 3")
+    watched.wait(10)
+    assert watched.shown[-1][3] == "computing, 2 of 4, about 26 s left"  # cell 2 took 17 s; 8 have passed
 
 
 def test_counters_never_run_backwards_and_stages_are_not_repeated() -> None:

@@ -69,6 +69,17 @@ def test_a_static_load_measures_the_stiffness(law: str, cone: str) -> None:
     assert WEIGHT / (0.1 - float(last.qpos[2])) == pytest.approx(stiffness, rel=0.01)
 
 
+@pytest.mark.parametrize("law", ["log_barrier", "conic"])
+def test_a_barrier_floats_in_proportion_to_its_smoothing(law: str) -> None:
+    """Both laws, at the same kappa: four edges share the weight's impulse, each kappa over phi / (h + tau)."""
+    scene, kappa, tau = ball(), 1e-4, 2 * 0.95 * 0.02
+    contact = family_model(law, scene, effective_mass=1.0, smoothing=kappa)
+    advance = partial(step, scene, apply_contact(scene.model, contact), control=jnp.zeros(0))
+    start = study.initial_state(scene)
+    last = jax.jit(lambda state: jax.lax.fori_loop(0, 2000, lambda _, at: advance(state=at)[0], state))(start)
+    assert float(last.qpos[2]) - 0.1 == pytest.approx(4 * kappa * (0.002 + tau) / (0.002 * WEIGHT), rel=1e-3)
+
+
 @pytest.mark.parametrize("law", list(LAWS))
 def test_derivatives_are_those_of_differences_in_both_modes(law: str) -> None:
     scene = ball()
@@ -197,6 +208,26 @@ def test_the_graph_has_the_packages_own_derivative(law: str, monkeypatch: pytest
     assert len(graphs) == 1
 
 
+def test_diagnose_judges_means_under_every_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What begins, and how much its step varies, hardly depend on the law: the ball flies freely until then."""
+    printed, found, pages = [], {}, {}
+    monkeypatch.setattr("mjx_study.cli.diagnose.print_report", lambda _, *given: printed.append(given))
+    for law in ("mujoco", "hunt_crossley", "log_barrier"):
+        options = ["--contact", law, "--samples", "60", "--horizon", "240"]
+        assert cli.main(["diagnose", "momentum_transfer", *options]) == 0
+        found[law], pages[law] = printed[-1][0], "\n".join(printed[-1][1])
+    means = {law: {each["estimator"]: each["mean"] for each in of["estimators"]} for law, of in found.items()}
+    assert means["mujoco"]["fobg"] == "biased" and "h^2 k" in pages["mujoco"]
+    for law, lead in (("hunt_crossley", 0.004), ("log_barrier", 0.002 + 0.95 * 0.04)):
+        assert means[law] == {"zobg": "unbiased", "fobg": "right", "aobg": "right"}
+        assert found[law]["derivatives"] == "right" and found[law]["onsets"] == found["mujoco"]["onsets"] == 60
+        assert found[law]["onset_spread"] == pytest.approx(found["mujoco"]["onset_spread"], rel=0.4)
+        (touch,) = found[law]["touches"]
+        assert 0 <= lead * touch["speed"] - touch["distance"] < 1.5 * 0.002 * touch["speed"]
+        assert f"{law} is not MuJoCo's law" in pages[law] and "take fobg" in pages[law]
+        assert not any(each in pages[law] for each in ("_onset", "--onset", "h^2 k", "solimp", " biased"))
+
+
 @pytest.mark.slow
 def test_bench_leaves_out_rivals_of_another_law() -> None:
     task = make_task("pusher", horizon=3)
@@ -210,7 +241,7 @@ def test_bench_leaves_out_rivals_of_another_law() -> None:
     ("command", "message"),
     [
         ("gradcheck pusher --contact conic --stock", "--stock is for MuJoCo's law, which conic does not have"),
-        ("diagnose pusher --contact conic", "--contact describes contacts in the terms of MuJoCo's law"),
+        ("diagnose pusher --contact conic --smoothing 0", "conic needs a smoothing above 0"),
         ("rollout pusher --contact mujoco --smoothing 1e-5", "--smoothing has no effect on MuJoCo's law"),
         ("sweep pusher --contact conic --onset linear --dry-run", "--onset is for MuJoCo's law"),
         ("sweep pusher --contact mujoco,conic --estimators fobg_onset --dry-run", "corrects MuJoCo's law, not conic"),

@@ -111,12 +111,14 @@ def test_jumps_of_a_step_add_up_whatever_their_order() -> None:
     qvel = jnp.array([-0.8, -1.3, -2.0])
     positioned = position_stage(scene, model, scene.template.qpos)
     forced = force_stage(model, positioned, qvel, jnp.zeros(0), jnp.zeros(0))
-    _, members = guards.guard_rows(model, positioned)
+    members = guards.find_guards(model, positioned, qvel, ends=False).members
     count = len(members)
-    assert count == CORNERS + 2
+    passes = members.any(axis=1) & (np.arange(count) < count - CORNERS)  # not upper corners, nor contacts
+    own = np.flatnonzero(passes)
+    assert len(own) == CORNERS + 2
 
     def sums(since, begins):
-        crossing, no = Crossings(begins, ~begins, since), jnp.zeros((), bool)
+        crossing, no = Crossings(begins & passes, ~begins & passes, since), jnp.zeros((), bool)
 
         def jump(guard):
             event = Events(jnp.zeros((), int), guard, ~begins[guard], no, *crossing.others(guard), ~no)
@@ -125,10 +127,10 @@ def test_jumps_of_a_step_add_up_whatever_their_order() -> None:
             return jnp.where(begins[guard], 1.0, -1.0) * (on - off)
 
         def velocity(kept):
-            prepared = guards.without(forced, (~kept).astype(qvel.dtype) @ members)
+            prepared = guards.without(forced, (~kept[own]).astype(qvel.dtype) @ members[own])
             return advance_velocity(model, prepared, constraint.run_solver(model, prepared))[0]
 
-        return jnp.sum(jax.vmap(jump)(jnp.arange(count)), axis=0), velocity(begins) - velocity(~begins)
+        return jnp.sum(jax.vmap(jump)(own), axis=0), velocity(begins) - velocity(~begins)
 
     random = np.random.default_rng(0)
     since = random.uniform(size=(12, count))
@@ -193,11 +195,11 @@ def test_a_box_that_lands_flat_has_the_slope(onset: str) -> None:
     assert found >= 4 * 350 and missed == 0 and replaced == 0  # some start in contact
 
 
-def test_a_box_that_lands_tilted_is_off_and_counted() -> None:
-    """Its corners replace each other in penetration, for which there is no term."""
+def test_a_box_that_lands_tilted_has_the_slope() -> None:
+    """Though its corners replace each other in penetration; by plain first order it is 96 % off."""
     slope, mean, (found, missed, replaced) = slope_and_mean(TILTED, "linear")
-    assert 0.2 < 1 - mean / slope < 0.4
-    assert replaced > 2 * 400 and missed < 0.5 * found
+    assert abs(mean / slope - 1) < 0.03
+    assert found > 8 * 400 and missed == 0 and replaced == 0
 
 
 @pytest.mark.parametrize("onset", ["linear", pytest.param("jump", marks=pytest.mark.slow)])

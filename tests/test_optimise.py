@@ -17,10 +17,10 @@ import estimators
 from estimators import ESTIMATORS, Differentiation, FirstOrder
 from mjx_study import cli
 from mjx_study.execution.run import run_study
-from mjx_study.experiment import descents, plan, sampling
+from mjx_study.experiment import descent_rollouts, descents, plan, sampling
 from mjx_study.experiment import iteration as descent
 from mjx_study.experiment.checkpoint import Checkpoint
-from mjx_study.experiment.descents import Backend
+from mjx_study.experiment.descent_rollouts import Backend
 from mjx_study.experiment.iteration import REASONS, begin, make_optimizer
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import StudyPlan, estimators_of
@@ -113,7 +113,7 @@ def test_seeds_on_a_reference_do_not_depend_on_those_drawn_with_them(monkeypatch
     study = on_reference("tennis", **SHORT | few | {"horizon": 20})
     together = descend(study)["theta"]
     for most in (10, 1):
-        monkeypatch.setattr(descents, "TOGETHER", most)
+        monkeypatch.setattr(descent_rollouts, "TOGETHER", most)
         np.testing.assert_allclose(descend(study)["theta"], together, rtol=1e-7)
     alone = descend(dataclasses.replace(study, seeds=1))["theta"]
     np.testing.assert_allclose(alone.sel(seed=0), together.sel(seed=0), rtol=1e-7)

@@ -333,7 +333,7 @@ def test_an_option_that_some_cells_read(chosen: dict[str, Any]) -> None:
     [
         ({}, {"kind": "gradients", "reference_samples": 600}),
         ({"reference_samples": 50}, {"kind": "gradients", "reference_samples": 50}),
-        ({"iterations": 3}, {"kind": "descents", "optimizer": "sgd", "evaluation_samples": 200}),
+        ({"iterations": 3}, {"kind": "descents", "evaluation_samples": 200}),
         ({"points": 5}, {"kind": "landscapes"}),
     ],
 )

@@ -19,7 +19,7 @@ UNIT = st.floats(-1, 1)
 
 
 def original(module: str, name: str) -> Any:
-    return getattr(patches._module(module), name)
+    return getattr(patches.mjx_module(module), name)
 
 
 LEVEL = """<mujoco><option timestep=".002"><flag contact="disable"/></option>

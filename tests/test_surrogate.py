@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.descents import Backend
+from mjx_study.experiment.descent_rollouts import Backend
 from mjx_study.experiment.iteration import begin, schedule_factors
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of

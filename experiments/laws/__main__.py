@@ -25,6 +25,7 @@ from experiments.laws import measure
 from experiments.laws.measure import (
     SAMPLED,
     TRAINED,
+    afloat,
     bodies,
     checked,
     compared,
@@ -35,6 +36,7 @@ from experiments.laws.measure import (
     trained,
 )
 from experiments.laws.page import (
+    AFLOAT,
     CELLS,
     CHECKED,
     CHECKS,
@@ -79,6 +81,7 @@ def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
         if row not in LAWS or LAWS[row][1] == "none":
             found["faithful bodies", row] = partial(bodies, LAWS[row][0] if row in LAWS else RIGID)
     found |= {("corner", row): partial(corner, **changes) for row, changes in CORNER.items()}
+    found |= {("afloat", row): partial(afloat, *each) for row, each in AFLOAT.items()}
     for name, law, cone in itertools.product(CHECKED, OTHERS, ("", "pyramidal")):
         if not cone or (name, law) in PYRAMIDAL:
             for kind, compute in (("gradcheck", checked), ("compare", compared)):
@@ -110,7 +113,8 @@ def run(asked: dict[tuple[str, str], Callable[[], dict[str, Any]]], into: Path |
             name: float(each) if np.ndim(each) == 0 and not isinstance(each, str | None) else each
             for name, each in numbers.items()
         }
-        with (into or (CHECKS if scene.startswith(("gradcheck", "compare", "corner")) else CELLS)).open("a") as file:
+        checks = scene.startswith(("gradcheck", "compare", "corner", "afloat"))
+        with (into or (CHECKS if checks else CELLS)).open("a") as file:
             file.write(json.dumps({"scene": scene, "row": row, **numbers}) + "\n")
         print(f"{scene}, {row}: {time.perf_counter() - begin:.0f} s", flush=True)
 

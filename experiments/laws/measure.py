@@ -23,7 +23,7 @@ from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.gradcheck import gradcheck, plan_gradcheck
-from mjx_study.objective import Simulator
+from mjx_study.objective import Simulator, compiled_rollout
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.rows import rows_of
 from mjx_study.simulation.contact import (
@@ -37,6 +37,7 @@ from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.law import make_law
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.task import Task
 
 POINTS, CHUNK = 4000, 250
@@ -56,6 +57,7 @@ TRAINED: Final = {
 SEEDS, DRAWS = 3, 1000
 BATCH: Final = 1000
 """Samples, and pairs of rollouts of the reference, of `compared`."""
+AFLOAT: Final = 300
 DURATION, NARROW = 0.8, 1e-6  # [s], [rad]
 
 
@@ -286,10 +288,11 @@ def checked(name: str, family: str, cone: str) -> dict[str, Any]:
     }
 
 
-def compared(name: str, family: str, cone: str) -> dict[str, Any]:
+def compared(name: str, family: str, cone: str, smoothing: float | None = None) -> dict[str, Any]:
     """What `compare` says of first order's mean under a law, at the task's middle stiffness."""
     stiffnesses = make_task(name).defaults.stiffnesses
     given: dict[str, Any] = {"cone": (cone,)} if cone else {}
+    given["smoothing"] = smoothing
     if FAMILIES[family].swept:
         given["stiffness"] = (float(stiffnesses[len(stiffnesses) // 2]),)
     about = StudyConfig(
@@ -307,9 +310,26 @@ def compared(name: str, family: str, cone: str) -> dict[str, Any]:
         "error": first.relative_error,
         "uncertainty": first.reference_uncertainty,
         "variances": first.variance / zeroth.variance,
+        "norm": first.gradient_norm,
         "residual": first.residual,
         "bad": first.unconverged + first.nonfinite + zeroth.nonfinite,
     }
+
+
+def afloat(family: str, smoothing: float | None = None) -> dict[str, Any]:
+    """Under a law with a smoothing [J], what `compare` says of `sliding_box`, how high its block floats [m], and in
+    which share of `AFLOAT` rollouts with noise it ends above its box."""
+    task = make_task("sliding_box", cone="pyramidal")
+    contact, rollout = single_contact(task, family, smoothing=smoothing)[0].contact, compiled_rollout(task)
+    assert task.metrics is not None
+
+    def states(key: Any, noise_scale: float) -> Any:
+        return rollout(task.theta, contact, key, jnp.full((), noise_scale))[0]
+
+    keys = jax.random.split(jax.random.key(0), AFLOAT)
+    aboard = [float(task.metrics(states(key, 1.0))["aboard"]) for key in keys]
+    height = float(states(keys[0], 0.0).qpos[-1, 1])
+    return compared(task.name, family, "pyramidal", smoothing) | {"height": height, "aboard": np.mean(aboard)}
 
 
 def corner(friction: float | None = None, timestep: float = 0.002, scale: float = 1.0) -> dict[str, Any]:

@@ -40,6 +40,11 @@ CORNER: Final[dict[str, dict[str, float]]] = {
     **{f"kappa x {each:g}": {"scale": each} for each in (0.1, 10.0)},
 }
 """Changes of `ball_wall` and of Kelvin-Voigt on it."""
+AFLOAT: Final[dict[str, tuple[str, float | None]]] = {
+    **{f"log_barrier, {each:g} J": ("log_barrier", each) for each in (1e-3, 1e-4, 1e-5)},
+    "conic": ("conic", None),
+}
+"""Laws on `sliding_box`, by kappa."""
 PYRAMIDAL: Final = {
     *itertools.product(("sliding_box", "ball_wall", "ball_wall:dome", "gripper", "landing"), ("log_barrier", "conic"))
 }
@@ -161,6 +166,14 @@ def tables() -> dict[str, str]:
         "of it in 1e-6 rad": lambda of: f"{100 * of['narrow']:.2g} %",
     }
     corners = [[row, *(cell("corner", row, say) for say in shares.values())] for row in CORNER]
+    lifted: dict[str, Callable[[dict[str, Any]], str]] = {
+        "floats at [mm]": lambda of: f"{1e3 * of['height']:.2g}",
+        "ends above the box": lambda of: f"{100 * of['aboard']:.0f} %",
+        "norm of E[FoBG]": lambda of: f"{of['norm']:.0f}",
+        "variance over zeroth order's": lambda of: f"{of['variances']:.1g}",
+        "distance from the reference": off,
+    }
+    afloat = [[row, *(cell("afloat", row, say) for say in lifted.values())] for row in AFLOAT]
     ways = "pusher: own", "in C", "ball_wall: own [1e-3]", "in C [1e-3]", "pusher [s]"
     rows = {
         "summary": (("law", *(name for _, name in first)), summary),
@@ -177,6 +190,7 @@ def tables() -> dict[str, str]:
         "gradcheck": (("task", *OTHERS), of_tasks("gradcheck", verdict)),
         "compare": (("task", *OTHERS), of_tasks("compare", off)),
         "refusals": (("tasks", "laws", "what is lacking"), refusals),
+        "afloat": (("law", *lifted), afloat),
         "corner": (("`ball_wall`", *shares), corners),
     }
     return {name: markdown_table(lines, header) for name, (header, lines) in rows.items()}

@@ -33,7 +33,9 @@ STIFFNESSES: Final = 4
 WEIGHT: Final = 0.01
 """Cost of holding all controls at their largest change."""
 ITERATIONS, SAMPLES = 100, 20
-RATES: Final = tuple(2.0**power for power in range(-20, 31))
+PACE: Final = 0.3
+"""Learning rate of Adam, in standard deviations of the noise: about the most that it moves a parameter in an iteration,
+whatever the variance of gradients through contact."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +68,6 @@ class Proposal:
         pair: names of the geoms whose contact is swept; None without one that has names.
         load: what that contact carries; None without one.
         stiffnesses: of that contact [N/m]; empty without one.
-        learning_rate: of gradient descent.
     """
 
     scene: Scene = dataclasses.field(repr=False)
@@ -79,7 +80,11 @@ class Proposal:
     pair: tuple[str, str] | None
     load: Load | None
     stiffnesses: tuple[float, ...]
-    learning_rate: float
+
+    @property
+    def learning_rate(self) -> float:
+        """Of descents by Adam, in the unit of the parameters."""
+        return rounded(PACE * self.drive.scale, 1)
 
     @property
     def damping(self) -> float:
@@ -119,8 +124,7 @@ def propose(scene: Scene) -> Proposal:
     stiffnesses = () if load is None else _stiffnesses(load, scene.timestep)
     limits = sorted({joint for trial in rollouts for joint in trial.limits})
     names = tuple(host.joint(joint).name or f"joint {joint}" for joint in limits)
-    rate = _learning_rate(drive, aim, steps)
-    return Proposal(scene, drive, steps, aim, touches, shares, names, pair, load, stiffnesses, rate)
+    return Proposal(scene, drive, steps, aim, touches, shares, names, pair, load, stiffnesses)
 
 
 def _longest(host: mujoco.MjModel) -> int:
@@ -213,23 +217,3 @@ def _half_size(host: mujoco.MjModel, geoms: Sequence[int]) -> float:
     """Least half size of those geoms that are not unbounded [m]."""
     sizes = [float(host.geom_aabb[geom, 3:].min()) for geom in geoms if host.geom_rbound[geom] > 0]
     return min(sizes, default=0.1)
-
-
-def _learning_rate(drive: Drive, aim: Aim, steps: int) -> float:
-    """Half of the best step along the slopes over held controls, each shared evenly by all steps."""
-    rows = 1 if drive.at_start else steps
-
-    def cost(held: np.ndarray) -> float:
-        trial = run_trial(drive, held[None], steps)
-        if trial.steps < steps:
-            return math.inf
-        effort = 0.0 if drive.at_start else WEIGHT * float(np.mean((held / (HELD * drive.scale)) ** 2))
-        return aim.misses(trial, steps) + effort
-
-    moves = drive.scale * np.eye(drive.size)
-    slope = np.array([cost(move) - cost(-move) for move in moves]) / (2 * drive.scale * rows)
-    if not np.isfinite(slope).all() or not slope.any():
-        return 1.0
-    descended = {rate: cost(-rate * slope) for rate in RATES}
-    best = min(descended, key=lambda rate: descended[rate])
-    return rounded(best / 2, 1)

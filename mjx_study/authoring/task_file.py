@@ -10,7 +10,7 @@ from typing import Final
 import jinja2
 import mujoco
 
-from mjx_study.authoring.proposal import HELD, ITERATIONS, SAMPLES, TRIALS, WEIGHT, Proposal
+from mjx_study.authoring.proposal import HELD, ITERATIONS, PACE, SAMPLES, TRIALS, WEIGHT, Proposal
 from mjx_study.authoring.trial import Touch
 from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.table import number
@@ -44,7 +44,14 @@ def source_of_task(mjcf: Path, found: Proposal) -> str:
     unit = "" if body is None else f" m along {'xyz'[aim.axis]}"
     by_time = sorted(found.touches.items(), key=lambda item: item[1].first)
     return pages.from_string(Path(__file__).with_suffix(".jinja").read_text()).render(
-        {"HELD": HELD, "ITERATIONS": ITERATIONS, "MOST_LISTED": MOST_LISTED, "SAMPLES": SAMPLES, "TRIALS": TRIALS},
+        {
+            "HELD": HELD,
+            "ITERATIONS": ITERATIONS,
+            "MOST_LISTED": MOST_LISTED,
+            "PACE": PACE,
+            "SAMPLES": SAMPLES,
+            "TRIALS": TRIALS,
+        },
         WEIGHT=WEIGHT,
         mjcf=mjcf,
         found=found,

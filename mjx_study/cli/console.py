@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import shlex
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -233,30 +234,34 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     seeds = f"seed {config['seed']}" if config["seeds"] == 1 else f"{config['seeds']} seeds from {config['seed']}"
     start, (mean, error) = DESCENTS["start_cost"], document["start_cost"]
     shown = [(DESCENTS | DERIVED)[name].heading for name in DESCENT_COLUMNS]
-    headings = ["estimator", *shown[:2], *document["start_metrics"], *shown[2:]]
+    costs = 1 + (config["seeds"] > 1)  # the best of one is that one
+    headings = ["estimator", *shown[:costs], *document["start_metrics"], *shown[2:]]
     lines = [
         f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
         f"{config['iterations']} iterations",
         f"{config['samples']} samples in each batch, {seeds}, "
         f"sigma {config['sigma']:g}; {start.heading} {with_error(mean, error, start.digits)}{metrics}",
         "",
-        *format_table([_row(run, onset) for run in document["runs"]], headings),
+        *format_table([_row(run, onset, costs) for run in document["runs"]], headings),
     ]
     for run in document["runs"]:
         for stop in run["stopped"]:
             label = label_of(run["estimator"], onset)
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
+    if paths := document.get("policies"):
+        least = [np.nanmin(_finite(run["final_cost"]), initial=np.inf) for run in document["runs"]]
+        best = shlex.join(["mjx-study", "rollout", config["task"], "--theta", paths[int(np.argmin(least))]])
+        lines.append(f"to see the best policy: {best}")
     return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
-def _row(run: dict[str, Any], onset: str) -> list[str]:
+def _row(run: dict[str, Any], onset: str, num_costs: int) -> list[str]:
     digits, costs = DESCENTS["final_cost"].digits, _finite(run["final_cost"])
     length = len(run["seconds"])
     weights = _finite([weight for row in run["history"]["alpha"][-max(1, length // 10) :] for weight in row])
     return [
         label_of(run["estimator"], onset),
-        _with_spread(np.mean, costs, digits),
-        _with_spread(np.min, costs, digits).partition(" ")[0],
+        *(_with_spread(np.mean, costs, digits), _with_spread(np.min, costs, digits).partition(" ")[0])[:num_costs],
         *(_with_spread(np.mean, _finite(values), 3) for values in run["metrics"].values()),
         DESCENTS["alpha"].text(float(np.mean(weights))) if len(weights) else "-",
         str(run["rollouts_per_iteration"] * length),

@@ -6,7 +6,7 @@ import shlex
 from mjx_study.choices import FAMILIES, is_file
 from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
-from mjx_study.diagnose.columns import CONTACTS, ESTIMATES
+from mjx_study.diagnose.columns import CONTACTS, DISTANCE, ESTIMATES, TOUCHES
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.options.parser import MIDDLE, TASK_OPTIONS, Parser
 from mjx_study.table import explain
@@ -14,10 +14,11 @@ from mjx_study.table import explain
 EPILOG = f"""\
 examples:
   mjx-study diagnose momentum_transfer --contact mujoco_default
+  mjx-study diagnose momentum_transfer --contact kelvin_voigt
   mjx-study diagnose robot.xml                 no cost is needed: one is made from the bodies' positions
 
 columns of the contacts and of the estimators:
-{explain(*CONTACTS, *ESTIMATES)}
+{explain(*TOUCHES, *CONTACTS, DISTANCE, *ESTIMATES)}
 
 The error is that of a gradient from as many samples as this machine computes in a second. Means are checked along
 paths, as in gradcheck --mean, and so is the bias. At least 23 samples are drawn, even if --samples is smaller. Exit
@@ -27,7 +28,7 @@ code 1 if a derivative is wrong.
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_contact_options(MIDDLE, many=False, analytic=False, smoothing=False)
+    command.add_contact_options(MIDDLE, many=False, analytic=False)
     command.add_option("samples", many=False, interval="[1, 1e7]", unset="500, or as many as fit into a minute")
 
 
@@ -39,8 +40,9 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         task = task_of(options)
-        contact, _ = single_contact(task, options.contact, options.stiffness, options.damping)
-    given = given_options(options, "contact", "stiffness", "damping", "sigma", *TASK_OPTIONS, "seed")
+        given = options.contact, options.stiffness, options.damping, options.smoothing
+        contact, _ = single_contact(task, *given)
+    given = given_options(options, "contact", "stiffness", "damping", "smoothing", "sigma", *TASK_OPTIONS, "seed")
     if not is_file(options.task):  # other commands default to several
         given["contact"] = contact.family
         if FAMILIES[contact.family].swept:
@@ -53,6 +55,7 @@ def run(options: argparse.Namespace) -> int:
             options.contact,
             options.stiffness,
             damping=options.damping,
+            smoothing=options.smoothing,
             samples=options.samples,
             seed=options.seed or 0,
             options=flags,

@@ -9,7 +9,10 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
+from operator import itemgetter
 from typing import Final
+
+from mjx_study.table import grouped
 
 EVENTS: Final = {
     "/jax/core/compile/jaxpr_trace_duration": "tracing",
@@ -64,7 +67,11 @@ class Activity:
         from mjx_study.graph.build import libraries_pending
 
         now, outermost = self._clock(), [each[0] for each in list(self._running.values()) if each]
-        found = [f"{what}, {now - since:.0f} s" for what, since in outermost if now - since >= SHORT]
+        same = grouped((each for each in outermost if now - each[1] >= SHORT), itemgetter(0))
+        found = [
+            f"{what}{f' ({len(each)} at once)' if each[1:] else ''}, {now - min(since for _, since in each):.0f} s"
+            for what, each in same.items()
+        ]
         pending = libraries_pending()
         libraries = f"building {pending} {'library' if pending == 1 else 'libraries'} of native code"
         return "; ".join([*found, *([libraries] if pending else [])])
@@ -97,16 +104,17 @@ class Display:
         self._show, self._activity, self._clock, self._within = show, activity, clock, within
         self._lock = threading.Lock()
         self._done, self._total, self._what = 0, 0, "starting"
-        self._first = self._last = 0, clock()
+        self._begun = self._first = self._last = 0, clock()
         self._said, self._silence, self._longest = clock(), min(FIRST, silence), silence
 
     def report(self, done: int, total: int, what: str) -> None:
         """Report progress, as a `mjx_study.progress.Progress`."""
         with self._lock:
             if total != self._total:
-                self._first = self._last = done, self._clock()
+                self._begun = self._first = self._last = done, self._clock()
             elif done > self._done:
                 self._last = done, self._clock()
+                self._first = self._last if self._first == self._begun else self._first
             self._done = max(done, self._done) if total == self._total else done
             before, self._total, self._what = self._what, total, what
             same = what.partition("; ")[0] == before.partition("; ")[0]
@@ -125,14 +133,16 @@ class Display:
         self._show(self._done, self._total, self._what, life)
 
     def _life(self) -> str:
-        """What is built, or how far the stage is and how long the rest takes at this pace."""
+        """What is built, or how far the stage is and how long the rest takes at this pace, at most if there was only
+        the first advance, which includes building."""
         if building := self._activity.describe():
             return building
         share = f", {self._done} of {self._total}" if self._total > 1 else ""
-        (first, begun), (last, moved) = self._first, self._last
+        known = self._first[0] < self._last[0]
+        (first, begun), (last, moved) = self._first if known else self._begun, self._last
         if first < last < self._total:
             left = (moved - begun) / (last - first) * (self._total - last) - (self._clock() - moved)
-            share += f", about {left:.0f} s left" if left > 1 else ""
+            share += f", {'about' if known else 'at most'} {left:.0f} s left" if left > 1 else ""
         return f"computing{share}"
 
 

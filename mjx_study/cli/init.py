@@ -58,5 +58,5 @@ def run(options: argparse.Namespace) -> int:
         lines.append("nothing touched in its test rollouts: there is no contact to study unless start or goal move")
     if written:
         here = "" if mjcf.parent == Path() else f"cd {shlex.quote(str(mjcf.parent))} && "
-        lines.append(f"next: {here}mjx-study compare {place}")
+        lines.append(f"next: {here}mjx-study compare {place} (or rollout, diagnose, optimise)")
     return print_report(options, document, lines, unwritten)

@@ -199,7 +199,10 @@ def _lines(rollout: Rollout, messages: tuple[str, ...], written: list[Path]) -> 
     facts, model = rollout.facts, rollout.model
     lines = [rollout.title]
     if "cost" in facts:
-        lines.append(f"cost {number(facts['cost'], 6)}, largest solver residual {number(facts['residual'], 2)}")
+        noise = "with" if facts["sigma"] else "without"
+        lines.append(
+            f"cost {noise} noise {number(facts['cost'], 6)}, largest solver residual {number(facts['residual'], 2)}"
+        )
     lines.append(f"{facts['steps']} steps of {1e3 * model.opt.timestep:g} ms, {facts['duration']:g} s")
     rows = [[name, *(f"{value:.4f}" for value in place)] for name, place in facts["bodies"].items()]
     if rows:

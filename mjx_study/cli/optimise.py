@@ -91,4 +91,5 @@ def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
         content = (json.dumps(policy | {"digest": digest_of_json(policy)}) + "\n").encode()
         name = f"policy-{run['estimator'].replace(':', '.')}.json"
         written.append(write_whole(folder / name, content))
+    document["policies"] = list(map(str, written))
     return written

@@ -18,6 +18,8 @@ from mjx_study.disk import remove_temporary_folders
 from mjx_study.progress import Progress
 
 RESUMABLE: Final = "the same command resumes where it stopped"
+ROOM: Final = 64
+"""Columns of a terminal for the bar, its counter and its clock."""
 INTERRUPTED: Final = "nothing was written"
 """Default continuation of "interrupted; ..."."""
 ENDINGS: Final = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
@@ -125,9 +127,13 @@ def shown_progress() -> Generator[Progress]:
 def _bar(activity: Activity) -> Generator[Show]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.table import Column
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    text = Column(no_wrap=True, overflow="ellipsis", max_width=max(20, console.width - ROOM))
+    what = TextColumn("{task.description}", table_column=text)
+    columns = what, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=None)
 
         def show(done: int, total: int, what: str, life: str) -> None:

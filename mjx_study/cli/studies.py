@@ -22,11 +22,15 @@ from mjx_study.experiment.study import StudyPlan
 from mjx_study.options.parser import UsageError
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
+from mjx_study.results.kind import findings_of
+from mjx_study.results.numbers import numbers_of
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.folder import Store, load_study, open_store
-from mjx_study.table import as_plain, digits_to_tell_apart, size
+from mjx_study.table import as_plain, digits_to_tell_apart, format_table, size
 
 KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
+MOST_ROWS = 40
+"""Maximum number of rows of the table at the end of a sweep; the report has all."""
 INTACT = "existing files are complete, and the same command resumes"
 
 
@@ -139,7 +143,10 @@ def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> 
         unwritten = f"cannot write to {folder}: {error.strerror or error}; {INTACT}"
     computed = dataset.attrs.get("computed_cells", missing - dataset.attrs["missing_cells"])
     sizes = ", ".join(f"{name} {length}" for name, length in dataset.sizes.items())
-    lines = [f"computed {computed} cells; {sizes}"]
+    titles, rows = numbers_of(dataset) or ([], [])
+    findings = findings_of(dataset)
+    lines = [*format_table(rows, titles), ""] if 0 < len(rows) <= MOST_ROWS else []
+    lines += [*(f"{sentence}." for sentence in findings), f"computed {computed} cells; {sizes}"]
     lines += [f"warning: {message}" for message in warnings_of(dataset) if message not in plan.warnings]
     lines += [f"written to {folder}: results.nc; mjx-study plot {folder} draws it"] if unwritten is None else []
     document = {
@@ -147,6 +154,7 @@ def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> 
         "computed": computed,
         "cells": {name: int(length) for name, length in dataset.sizes.items()},
         "variables": [str(name) for name in dataset.data_vars],
+        "findings": findings,
         "warnings": list(warnings_of(dataset)),
     }
     failed = len(json.loads(dataset.attrs.get("failed_cells", "{}")))

@@ -65,7 +65,8 @@ def advise(found: Diagnosis) -> Iterator[Advice]:
         yield _bias(found)
     elif not found.best.estimator.endswith("_onset"):
         return  # the onset term is not recommended
-    yield from _onset(found)
+    if not found.law:
+        yield from _onset(found)
 
 
 def _best(found: Diagnosis) -> Advice:
@@ -85,8 +86,8 @@ def _best(found: Diagnosis) -> Advice:
 def _bias(found: Diagnosis) -> Advice:
     by_name, timestep = {each.estimator: each for each in found.estimators}, found.task.scene.timestep
     text = f"plain first order is biased by {found.bias_text(by_name['fobg'])}, "
-    corrected = by_name["fobg_onset"].verdict == "right"
-    if max([each.jump for each in found.touches] or [found.onsets["onset_strength"]]) <= SMOOTH_SHARE:
+    corrected = not found.law and by_name["fobg_onset"].verdict == "right"
+    if found.law or max([each.jump for each in found.touches] or [found.onsets["onset_strength"]]) <= SMOOTH_SHARE:
         text += "though force sets in without a jump: something else jumps, as where corners and edges touch, "
         text += "and only zobg is sure to be unbiased"
     elif corrected:

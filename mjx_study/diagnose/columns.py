@@ -28,16 +28,21 @@ MEANS: Final[tuple[Column, ...]] = (
     Column("verdict", itemgetter("verdict"), "right (within 5 %), biased, or undecided: too few samples"),
 )
 """Columns of `gradcheck --mean`, for `MeanCheck.as_dict`."""
-CONTACTS: Final[tuple[Column, ...]] = (
+TOUCHES: Final[tuple[Column, ...]] = (
     _attribute("time", ".3g", "t [s]", "time at which the contact begins"),
     _attribute("speed", ".2g", "v [m/s]", "approach speed"),
+)
+"""Columns of the contacts of a diagnosis, for `ContactSummary`."""
+DISTANCE: Final = Column("d [mm]", lambda each: f"{1e3 * each.distance:.2g}", "distance at that time, under other laws")
+"""The same under laws other than MuJoCo's."""
+CONTACTS: Final[tuple[Column, ...]] = (
     _attribute("damping", ".2g", "h b", "damping of the contact over one step h"),
     _attribute("stiffness", ".2g", "h^2 k", "its stiffness over one step"),
     _attribute("travel", ".2g", "h v / width", "travel per step over the depth over which the impedance rises"),
     _attribute("impedance", "g", "impedance", "d_0, at first touch: 0 is a smooth onset, MuJoCo's 0.9 a jump"),
     Column("step", lambda each: "stable" if each.stable else "UNSTABLE", "unstable if h^2 k >= 4 - 2 h b"),
 )
-"""Columns of the contacts of a diagnosis, for `ContactSummary`."""
+"""The same under MuJoCo's law."""
 ESTIMATES: Final[tuple[Column, ...]] = (
     Column("error", itemgetter(0), "bias and standard deviation after a second of computing, relative"),
     Column("95 % interval", itemgetter(1), "interval of the error, from that of the variance"),

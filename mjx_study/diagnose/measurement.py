@@ -1,4 +1,4 @@
-"""Variances, times and means of the five estimators under one contact model.
+"""Variances, times and means of the estimators under one contact model.
 
 The error of an estimator after a second of computing is sqrt(bias^2 + variance x seconds per sample), relative to the
 gradient. The bias is the detectable deviation of the estimator's mean from the mean cost's slope along a path
@@ -23,7 +23,7 @@ from mjx_study.objective import BlankObjective, Simulator, chunk_for
 from mjx_study.progress import Progress, silent
 from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import local_devices, precision
-from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.contact import ContactModel, has_mujoco_law
 from mjx_study.simulation.scene import num_constraint_rows
 from mjx_study.tasks.task import Task
 
@@ -86,7 +86,7 @@ class Measurement:
     """Measurements of the estimators under one contact model, best first.
 
     Attributes:
-        onsets: `mjx_study.results.variables.ONSETS` of the first-order batch.
+        onsets: `mjx_study.results.variables.ONSETS` of the first-order batch; empty under a law other than MuJoCo's.
         unconverged: number of rollouts in which the solver did not converge.
     """
 
@@ -128,8 +128,10 @@ class Measurement:
         return self.best.variance / left if left > 0 else math.inf
 
 
-def estimators_of(task: Task) -> list[Estimator]:
-    return [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
+def estimators_of(task: Task, contact: ContactModel | None) -> list[Estimator]:
+    """The five estimators, or the three without an onset term under a law other than MuJoCo's."""
+    names = [name for name in ESTIMATORS if has_mujoco_law(contact) or not name.endswith("_onset")]
+    return [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in names]
 
 
 def chunk_of(task: Task, samples: int) -> int:
@@ -162,7 +164,7 @@ def measure(
     The simulator's compiled programs serve every contact model, None being the MJCF's; samples as in `diagnose_task`.
     """
     task = simulator.task
-    chosen = estimators_of(task)
+    chosen = estimators_of(task, contact)
     oracles, objective, keys = oracles_of(chosen, "evaluation"), simulator.objective(contact), cell_keys(seed, 1)
 
     def drawn(count: int):
@@ -189,8 +191,10 @@ def measure(
         _measured(each, batches, sum(seconds[oracle] for oracle in each.needs), paths.get(each, ()), reach, samples)
         for each in chosen
     ]
-    events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
-    onsets = dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True))
+    onsets = {}
+    if "corrected" in batches:
+        events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
+        onsets = dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True))
     unsolved = max(unconverged(each, precision()) for each in residuals.values())
     unordered = Measurement(samples, onsets, unsolved, tuple(found))
     order = sorted(found, key=lambda each: each.error(unordered.norm))

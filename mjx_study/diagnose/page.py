@@ -8,7 +8,7 @@ import textwrap
 from typing import Any, Final
 
 from mjx_study.diagnose.advice import advise, cautions
-from mjx_study.diagnose.columns import CONTACTS, ESTIMATES
+from mjx_study.diagnose.columns import CONTACTS, DISTANCE, ESTIMATES, TOUCHES
 from mjx_study.diagnose.means import ALONG_MEANS
 from mjx_study.diagnose.measurement import RESOLVED_SE, Measured
 from mjx_study.diagnose.run import Diagnosis, round_up
@@ -16,9 +16,8 @@ from mjx_study.gradcheck.diagnosis import MEANING
 from mjx_study.runtime import environment
 from mjx_study.table import Column, as_plain, percent, tabulate, with_error
 
-LEGEND: Final = (
-    "  zobg: zeroth order; fobg: first order; aobg: both, weighted; _onset: with a term for contact that begins or ends"
-)
+LEGEND: Final = "  zobg: zeroth order; fobg: first order; aobg: both, weighted"
+TERM: Final = "; _onset: with a term for contact that begins or ends"
 MAX_ERROR: Final = 100.0
 """Upper end beyond which the interval of a relative error is uninformative."""
 MAX_SHOWN: Final = 6
@@ -77,7 +76,7 @@ def page_lines(found: Diagnosis) -> list[str]:
         "contact",
         *_contact_lines(found),
     ]
-    if found.onsets.get("onsets"):
+    if found.onsets.get("onsets") and not found.law:
         lines.append(f"{compare} --estimators fobg_onset --samples {found.samples} --json")
     steps = re.sub(r" --sigma \S+", "", check)  # steps have no noise
     lines += ["", "derivatives of a step", f"  {_derivatives(found)}", steps]
@@ -102,22 +101,25 @@ def _derivatives(found: Diagnosis) -> str:
 def _contact_lines(found: Diagnosis) -> list[str]:
     onsets = found.onsets.get("onsets", 0)
     lines = [f"  contacts that begin in a rollout with noise: {onsets / found.samples:.2g}"]
+    if found.law:
+        before = f" a contact begins {1e3 * found.lead:.3g} ms before touch, where it acts;" if found.lead else ""
+        lines.insert(0, f"  {found.law} is not MuJoCo's law:{before} onset terms and impedance do not apply")
     if onsets:
-        lines += [
-            f"  step at which the first begins: standard deviation {found.onsets['onset_spread']:.2g}",
-            f"  approach speed that a contact takes in its first step: {percent(found.onsets['onset_strength'])}",
-        ]
+        lines.append(f"  step at which the first begins: standard deviation {found.onsets['onset_spread']:.2g}")
+        if "onset_strength" in found.onsets:
+            share = percent(found.onsets["onset_strength"])
+            lines.append(f"  approach speed that a contact takes in its first step: {share}")
         for name, what in (("missed", "for lack of slots"), ("replaced", "since corners or edges replace others")):
             if count := found.onsets.get(f"onsets_{name}", 0):
                 lines.append(f"  contacts per rollout without an onset term {what}: {count / found.samples:.2g}")
     if not found.touches:
         return [*lines, "  contacts that begin in the rollout without noise: 0"]
-    worst = sorted(found.touches, key=lambda each: (each.stable, -each.jump, -each.travel))
+    worst = sorted(found.touches, key=lambda each: (each.stable, -each.jump, -(each.travel or each.speed)))
     pair = Column("  without noise", lambda each: f"  {each.pair}")
     more = len(worst) - MAX_SHOWN
     return [
         *lines,
-        *tabulate(worst[:MAX_SHOWN], [pair, *CONTACTS]),
+        *tabulate(worst[:MAX_SHOWN], [pair, *TOUCHES, *([DISTANCE] if found.law else CONTACTS)]),
         *([f"  and {more} more"] if more > 0 else []),
     ]
 
@@ -125,7 +127,7 @@ def _contact_lines(found: Diagnosis) -> list[str]:
 def _estimator_lines(found: Diagnosis) -> list[str]:
     name = Column("  estimator", lambda row: f"  {row[-1]}")
     rows = [(*_estimate(found, each), each.estimator) for each in found.estimators]
-    return [*tabulate(rows, [name, *ESTIMATES]), LEGEND]
+    return [*tabulate(rows, [name, *ESTIMATES]), f"{LEGEND}{'' if found.law else TERM}"]
 
 
 def _estimate(found: Diagnosis, each: Measured) -> tuple[str, str, str, str]:

@@ -6,11 +6,10 @@ from typing import Final
 
 from mjx_study.choices import is_file, takes_stiffness
 from mjx_study.diagnose.measurement import SAMPLES, Measured, Measurement, chunk_of, estimators_of, measure
-from mjx_study.diagnose.setting import ContactSummary, RolloutSetting, setting_of, touches_of
+from mjx_study.diagnose.setting import ContactSummary, RolloutSetting, events_of, lead_of, setting_of, touches_of
 from mjx_study.experiment.memory import check_memory
 from mjx_study.gradcheck import GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
-from mjx_study.options.option import OptionError
 from mjx_study.progress import Progress, silent
 from mjx_study.simulation.contact import has_mujoco_law
 from mjx_study.tasks.contact_grid import single_contact
@@ -32,6 +31,7 @@ class Diagnosis(Measurement):
     Attributes:
         subject: the model as named by the user.
         contact, warnings: label of the contact model, and warnings about it.
+        law, lead: name of its law, None if MuJoCo's, and the time before touch from which it acts [s].
         touches: contacts that begin in the zero-noise rollout.
         options: contact options as command-line flags.
     """
@@ -40,6 +40,8 @@ class Diagnosis(Measurement):
     task: Task
     setting: RolloutSetting
     contact: str
+    law: str | None
+    lead: float
     touches: tuple[ContactSummary, ...]
     derivatives: GradcheckReport
     warnings: tuple[str, ...]
@@ -83,6 +85,7 @@ def diagnose_task(
     stiffness: float | None = None,
     *,
     damping: float | None = None,
+    smoothing: float | None = None,
     samples: int | None = None,
     seed: int = 0,
     options: str = "",
@@ -92,7 +95,7 @@ def diagnose_task(
 
     Args:
         subject: the model as named by the user; for a file, the gradient check covers single steps only.
-        family, stiffness, damping: of the contact [N/m, N s/m]; None for those of a single run.
+        family, stiffness, damping, smoothing: of the contact [N/m, N s/m, J]; None for those of a single run.
         samples: samples per batch, and per node of the paths along which means are checked; None for `SAMPLES`, or as
             many as fit into `BUDGET_SECONDS`.
         options: contact options as command-line flags.
@@ -101,14 +104,11 @@ def diagnose_task(
         ValueError: there is no such contact model, or the batches do not fit in memory.
     """
     check_soundness(task)
-    cell, warnings = single_contact(task, family, stiffness, damping)
-    if not has_mujoco_law(cell.contact):
-        what = f"describes contacts in the terms of MuJoCo's law, which {cell.family} does not have"
-        raise OptionError("contact", f"{what}: take compare and gradcheck")
-    check_memory(task, estimators_of(task), samples or SAMPLES)
+    cell, warnings = single_contact(task, family, stiffness, damping, smoothing)
+    check_memory(task, estimators_of(task, cell.contact), samples or SAMPLES)
     progress(0, 4, PARTS[0])
     touches = tuple(touches_of(task, cell))
-    common = {"seed": seed, "damping": damping, "states": STATES}
+    common = {"seed": seed, "damping": damping, "smoothing": smoothing, "states": STATES}
     if is_file(subject):
         plan = plan_scene_gradcheck(task.scene, [cell.family], None, horizon=task.horizon, **common)
     else:
@@ -122,6 +122,8 @@ def diagnose_task(
     derivatives = gradcheck(plan, part(1))
     simulator = Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES))
     found = measure(simulator, cell.contact, samples, seed, part(2))
+    if not has_mujoco_law(cell.contact):
+        found = dataclasses.replace(found, onsets=events_of(task, cell, found.samples, seed))
     progress(4, 4, "done")
     return Diagnosis(
         **vars(found),
@@ -129,6 +131,8 @@ def diagnose_task(
         task=task,
         setting=setting_of(subject, task),
         contact=cell.label,
+        law=None if has_mujoco_law(cell.contact) else cell.family,
+        lead=lead_of(task, cell),
         touches=touches,
         derivatives=derivatives,
         warnings=tuple(warnings),

@@ -16,6 +16,7 @@ class Forecast:
     computed: int  # cells already in the folder
     programs: int  # rollout programs to compile
     rollouts: int  # to simulate, including those to differentiate
+    references: int  # and at most, where references need more pairs
     gradients: int  # rollouts to differentiate
     kept: int  # size of all cells' arrays [bytes]
     memory: int  # size of the largest cell's batches held at once [bytes]
@@ -25,7 +26,8 @@ class Forecast:
         return [
             f"cells: {self.cells}, {self.computed} computed, {self.cells - self.computed} to compute",
             f"programs to compile: {self.programs}",
-            f"rollouts: about {count(self.rollouts)}, {count(self.gradients)} of them differentiated",
+            f"rollouts: about {count(self.rollouts)}, {count(self.gradients)} of them differentiated"
+            + (f", and up to {count(self.references)} where references need them" if self.references else ""),
             f"arrays kept: {size(self.kept)}; batches of a cell: about {size(self.memory)} of memory",
             "nothing was computed or written",
         ]
@@ -46,6 +48,7 @@ def forecast_study(plan: StudyPlan, folder: Path | None = None, *, accept_versio
         computed=len(plan.cells) - len(left.cells),
         programs=left.compilations,
         rollouts=sum(int(total) for total, _ in rollouts),
+        references=sum(plan.kind.more_rollouts(plan, cell) for cell in left.cells),
         gradients=sum(int(differentiated) for _, differentiated in rollouts),
         kept=sum(plan.kind.size(plan, cell) for cell in plan.cells),
         memory=plan.memory,

@@ -67,6 +67,7 @@ from mjx_study.results.findings import gradient_findings
 from mjx_study.results.kind import Drawing
 from mjx_study.results.rows import rows_of
 from mjx_study.results.variables import GRADIENTS, ONSETS
+from mjx_study.tasks.task import Task
 
 PILOT: Final = LARGEST_BLOCK
 """Maximum number of samples of the first batch used to select among the reference's control variates."""
@@ -109,6 +110,10 @@ class Gradients(StudyKind):
         candidates = 0 if cell.model.analytic else CANDIDATES
         batches = plan.config.seeds * rollouts_of(plan.oracles, cell.samples, plan.task_of(cell))
         return batches + [2 * plan.settings.reference_samples + candidates, candidates]
+
+    def more_rollouts(self, plan: StudyPlan, cell: StudyCell) -> int:
+        pairs = plan.settings.reference_samples
+        return 2 * pairs * (_parts(plan, plan.task_of(cell)) - 1)
 
     def computation(self, plan: StudyPlan) -> "GradientComputation":
         return GradientComputation(plan)
@@ -364,6 +369,10 @@ class GradientComputation(Computation):
             return reference_of(task, objective, *self._keys_of_reference(index), pilot, soft)
 
         pairs = self._config.settings.reference_samples
-        given = self._config.reference_samples is not None
-        reference, parts = averaged(part, 1 if given else most_parts(task, pairs))
+        reference, parts = averaged(part, _parts(self._plan, task))
         return reference, parts * pairs
+
+
+def _parts(plan: StudyPlan, task: Task) -> int:
+    """Maximum number of references that are averaged: one if the configuration sets their pairs."""
+    return 1 if plan.config.reference_samples is not None else most_parts(task, plan.settings.reference_samples)

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
+from typing import Final
 
 import jax
 
@@ -14,6 +15,7 @@ from mjx_study.experiment.memory import LARGEST_BATCH
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.experiment.study import Group, StudyCell, StudyKind, StudyPlan, estimators_of
 from mjx_study.experiment.unused_options import reject_unused_options
+from mjx_study.graph.native import in_numpy
 from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for, natively
 from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS, SAMPLES, NamedTask, StudyConfig
@@ -21,11 +23,15 @@ from mjx_study.options.option import OptionError
 from mjx_study.results.kind import find_kind
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import has_mujoco_law
+from mjx_study.table import count
 from mjx_study.tasks import TASKS, task_with_options
 from mjx_study.tasks.contact_grid import Grid, backward_grid, family_grid, single_defaults, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task, check_shapes
+
+IN_NUMPY: Final = 10_000_000
+"""Steps, a minute or so, from which a study says that NumPy computes them."""
 
 
 def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, single: bool = False) -> StudyPlan:
@@ -86,6 +92,10 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
         size = chunk_for(most, local_devices(), tasks, own_program=kind.one_program)
     plan = StudyPlan(config, tuple(groups), tuple(cells), size, tuple(dict.fromkeys(messages)))
     kind.check_memory(plan)
+    steps = sum(int(kind.rollouts(plan, cell)[0]) * plan.task_of(cell).horizon for cell in cells)
+    if steps > IN_NUMPY and in_numpy():
+        message = f"NumPy computes {count(steps)} steps: with a C compiler they take a tenth of the time"
+        plan = dataclasses.replace(plan, warnings=(*plan.warnings, f"{message} (docs/native.md)"))
     for cell in {cell.group: cell for cell in cells}.values():
         corrected = [each.name for each in estimators_of(plan, cell) if "corrected" in each.needs]
         if config.surrogate and corrected:

@@ -24,11 +24,11 @@ SPAN_SIGMAS: Final = 10.0
 def recipe_of(config: StudyConfig, task: Task) -> Recipe:
     """The settings of a task's descents: the configuration's, else those of the task's recipe; OptionError if one is
     missing."""
-    given = {name: getattr(config, name) for name in ("iterations", "learning_rate", "decay")}
+    given = {name: getattr(config, name) for name in ("iterations", "learning_rate", "decay", "optimizer")}
     given |= {"samples": None if config.samples is None else max(config.samples)}
     if (recipe := task.defaults.recipe) is not None:
         return dataclasses.replace(recipe, **{name: value for name, value in given.items() if value is not None})
-    given["decay"] = given["decay"] or 0.0
+    given |= {"decay": given["decay"] or 0.0, "optimizer": given["optimizer"] or "sgd"}
     if missing := [name for name, value in given.items() if value is None]:
         first, *others = missing
         more = ", as must {}" * len(others)

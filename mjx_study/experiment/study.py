@@ -136,7 +136,9 @@ class StudyPlan:
     def fields(self) -> dict[str, Any]:
         """Fields of the configuration as a manifest holds them."""
         named = {"tasks": self.config.task_names, "estimators": self.config.estimator_names}
-        return self.config.resolved() | named | {"iterations": self.iterations}
+        optimizers = {group.recipe.optimizer for group in self.groups if group.recipe}
+        shared = optimizers.pop() if len(optimizers) == 1 else None
+        return self.config.resolved() | named | {"iterations": self.iterations, "optimizer": shared}
 
     @property
     def contents(self) -> dict[str, str]:
@@ -261,6 +263,10 @@ class StudyKind(StudyResults):
     @abstractmethod
     def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
         """Approximate number of rollouts of a cell, and of those differentiated."""
+
+    def more_rollouts(self, plan: StudyPlan, cell: StudyCell) -> int:
+        """Maximum number of further rollouts, by what is found."""
+        return 0
 
     @abstractmethod
     def computation(self, plan: StudyPlan) -> Computation:

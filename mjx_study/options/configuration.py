@@ -65,7 +65,6 @@ class Settings:
     kind: str
     points: int = 1
     reference_samples: int = 600
-    optimizer: str = "sgd"
     evaluation_samples: int = 200
 
 
@@ -138,7 +137,7 @@ class StudyConfig:
         None, "LO,HI", "range of the line", "(-inf, inf)", study="landscapes", unset=UNSET_TASK
     )
     direction: str | None = declared(None, "DIR", "random, or a parameter's index", study="landscapes", unset="random")
-    optimizer: str | None = declared(None, "NAME", "optax optimiser", study="descents", unset="sgd")
+    optimizer: str | None = declared(None, "NAME", "optax optimiser", study="descents", unset=UNSET_TASK)
     learning_rate: float | None = declared(None, "R", "learning rate", "(0, inf)", study="descents", unset=UNSET_TASK)
     decay: float | None = declared(
         None, "A", "learning rate / i^A at iteration i", "[0, 2]", study="descents", unset=UNSET_TASK

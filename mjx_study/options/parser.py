@@ -120,14 +120,11 @@ class Parser(argparse.ArgumentParser):
         *,
         many: bool = True,
         analytic: bool = True,
-        smoothing: bool = True,
     ) -> None:
-        """Add the contact models: one or many, with or without the analytic reference and the smoothing of laws."""
+        """Add the contact models: one or many, with or without the analytic reference."""
         self.add_option("stiffness", many=many, unset=stiffness)
         self.add_option("contact", many=many, unset=contact, choices=CONTACTS if analytic else tuple(FAMILIES))
-        self.add_option("damping")
-        if smoothing:
-            self.add_option("smoothing")
+        self.add_options("damping", "smoothing")
 
     def add_estimator_options(self) -> None:
         self.add_options("noise", *ESTIMATOR_OPTIONS, "published", "onset")

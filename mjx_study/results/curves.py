@@ -30,10 +30,18 @@ def line_of(dataset: xr.Dataset) -> tuple[str, str]:
 
 
 def landscape_findings(dataset: xr.Dataset) -> list[str]:
-    """Report where the mean of FoBG differs from the slope of the mean cost."""
-    both = {"zobg", "fobg"} <= set(dataset["estimator"].values)
-    name = label_of("fobg", onset_of(dataset))
-    return [f"{label}: {_gap(one, f'E[{name}]')}" for label, one in curves_of(dataset)] if both else []
+    """Report where the mean of FoBG differs from the slope of the mean cost, and costs that are least at an end."""
+    both, name = {"zobg", "fobg"} <= set(dataset["estimator"].values), label_of("fobg", onset_of(dataset))
+    curves = curves_of(dataset)
+    found = [f"{label}: {_gap(one, f'E[{name}]')}" for label, one in curves] if both else []
+    ends = [label for label, one in curves if _least(one) in (0, one.sizes["point"] - 1)]
+    if ends:
+        found.append(f"{', '.join(ends)}: the mean cost is least at an end of the line; --span makes it longer")
+    return found
+
+
+def _least(one: xr.Dataset) -> int:
+    return int(one["smoothed"].fillna(np.inf).argmin("point"))
 
 
 def _gap(one: xr.Dataset, mean: str) -> str:
@@ -49,7 +57,9 @@ def _gap(one: xr.Dataset, mean: str) -> str:
         source, uncertainty = "E[ZoBG]", f"more than {DETECTED_SE:g} standard errors"
     seen = np.abs(first - slope) > error
     if not np.any(seen):
-        return f"{mean} nowhere differs from {source} by {uncertainty}"
+        lost = error >= np.nanmax(np.abs(first), initial=0.0)
+        blind = f"; at {percent(float(np.mean(lost)))} of the points, no slope as large as {mean}'s would be seen"
+        return f"{mean} nowhere differs from {source} by {uncertainty}" + blind * bool(np.any(lost))
     name, unit = line_of(one)
     unit = f" {unit}" if unit else ""
     worst = int(np.argmax(np.where(seen, np.abs(first - slope), -np.inf)))

@@ -103,9 +103,9 @@ START: Final = "start_metric_"
 """Prefixes of a task's metrics: of the final policies, and of the initial one."""
 STEP: Final = ("iteration", *BATCH)
 DESCENTS: Final = {
-    "final_cost": Variable(BATCH, "cost", "mean cost of the final policy", "final cost", 4),
+    "final_cost": Variable(BATCH, "cost", "mean cost of the final policy with noise", "final cost", 4),
     "final_cost_se": Variable(BATCH, "cost", "standard error of final_cost"),
-    "start_cost": Variable((), "cost", "mean cost of the initial policy", "cost at the start", 4),
+    "start_cost": Variable((), "cost", "mean cost of the initial policy with noise", "cost at the start", 4),
     "start_cost_se": Variable((), "cost", "standard error of start_cost"),
     "stopped_at": Variable(BATCH, "1", "iteration at which a seed stopped before the end; NaN for none"),
     "reason": Variable(BATCH, "1", "why it stopped, an index into `experiment.iteration.REASONS`; NaN for none"),
@@ -157,8 +157,9 @@ COLUMNS: Final = (
 DETAILS: Final = ("gradient_norm", "effective_samples", "cosine", "epsilon", "discrepancy", "residual", "nonfinite")
 """Columns that only --details shows."""
 MARKS: Final = """\
-After the arrows: the same without the sampling noise of batch and reference, ± one standard error; errors below two
-of them are not detected. < and >: bounds of two standard errors where nothing is left; -: noise explains all of it."""
+After the arrows: the same without the sampling noise of batch and reference, ± one standard error. Errors below two
+of them are not detected; a mean is called biased from p = 0.001, about 3.3 of them. < and >: bounds of two standard
+errors where nothing is left; -: noise explains all of it."""
 MEASURED: Final = ("seconds", "seconds_per_sample")
 """Measured times, the only variables that differ from run to run."""
 

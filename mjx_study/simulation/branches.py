@@ -25,15 +25,16 @@ from jaxtyping import Array, Bool, Float, Int
 from mjx_study.simulation import guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Scalar
+from mjx_study.simulation.corners import corner_pairs
 from mjx_study.simulation.dynamics import Control, ControlLaw, Controls, State, solved_step, step, with_solver
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import Passages, least_travel, passages, timestep_of, without_derivative
+from mjx_study.simulation.onset import Passages, least_travel, passages, slots_for, timestep_of, without_derivative
 from mjx_study.simulation.over_model import moved_by_model
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Events, OnsetCounts, Past, at_touch, changes, events_of
 
 SLOTS: Final = 8
-"""Number of events with branches of their own per rollout; later ones are only counted."""
+"""Number of events with branches of their own per rollout, more where corners meet planes; later ones are counted."""
 CostToGo = Callable[[Int[Array, ""], State], Scalar]
 
 
@@ -45,7 +46,7 @@ def jump_term(
     control_law: ControlLaw,
     running_cost: Callable[[State, Control], Scalar],
     final_cost: Callable[[State], Scalar],
-    slots: int = SLOTS,
+    slots: int | None = None,
 ) -> tuple[Scalar, OnsetCounts]:
     """Return zero, with the onset term as its derivative with respect to the model and whatever the states depend on.
 
@@ -76,6 +77,8 @@ def jump_term(
     course = jax.vmap(lambda state, control: solved_step(scene, model, state, control)[-1])(before, controls)
     past = Past.none(jax.tree.map(lambda leaf: leaf[0], course))
     past, found = jax.lax.scan(lambda past, here: changes(here, past, timestep), past, course)
+    if slots is None:
+        slots = slots_for(scene, len(controls)) if corner_pairs(model) else SLOTS
     events = events_of(found, slots)
     slots = len(events.used)
     filled = jnp.sum(events.used)

@@ -1,13 +1,13 @@
 """Guards of limits and contacts: distances below zero while their constraint rows exist, and rows where one is zero.
 
-A guard is the distance of a limit or contact minus its margin. Where a convex geom meets a plane, MJX reports only
-corners that are at most `SKIN` higher than the deepest one: such a corner has a second condition, and its guard is the
-larger of the two. At zero of the second, a corner appears or vanishes in penetration.
+A guard is the distance of a limit or contact minus its margin, but for boxes and meshes at planes, whose corners have
+more than one (`corners`).
 """
 
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -15,27 +15,31 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import ELLIPTIC, Qvel, Rows, Scalar, row_force
+from mjx_study.simulation.corners import CONVEX, PLANE, Corners, corner_pairs, corners
 from mjx_study.simulation.patches import AT_FIRST_TOUCH, DAMPER, SPRING, Place, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
-SKIN: Final = 1e-3
-"""MJX's limit [m] on how much higher than the deepest corner of a convex geom another may be to touch a plane."""
-_PLANE: Final = int(mujoco.mjtGeom.mjGEOM_PLANE)
-_CONVEX: Final = (int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_MESH))
-_EDGED: Final = (*_CONVEX, int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+_EDGED: Final = (*CONVEX, int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
 class Guards(NamedTuple):
-    """Every limit, then every contact.
+    """Every limit, then every corner of a convex geom at a plane, then every contact.
 
     Attributes:
-        distance: what is below zero while the rows exist [m or rad]; zero or above where they do not.
-        weights: combination of constraint rows whose Jacobian is the distance's derivative.
+        distance: what is below zero while the rows exist [m or rad]; zero or above where they do not, and for contacts
+            of which corners are the guards.
+        speed: its rate [m/s or rad/s].
+        slopes: its derivative over the coordinates, of the guard of an index.
+        weights: combination of constraint rows that moves as the distance does.
+        members: 0/1 mask of the rows that switch on with the guard.
         deep: whether the rows begin or end in penetration, at the limit of the skin.
     """
 
     distance: Float[Array, " guards"]
+    speed: Float[Array, " guards"]
+    slopes: Callable[[Int[Array, ""]], Qvel]
     weights: Float[Array, "guards rows"]
+    members: Float[Array, "guards rows"]
     deep: Bool[Array, " guards"]
 
 
@@ -46,7 +50,7 @@ def num_guards(data: mjx.Data) -> int:
 
 
 def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
-    """Map each guard (limits first, then contacts) to its constraint rows; static, both `(guards, rows)`.
+    """Map each limit, then each contact to its constraint rows; static, both `(guards, rows)`.
 
     The weights combine rows into the guard's normal row (the mean of two opposite pyramid edges); the 0/1 mask tells
     the rows that switch on with the guard.
@@ -64,34 +68,30 @@ def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray
 
 
 def find_guards(model: mjx.Model, data: mjx.Data, qvel: Qvel, ends: bool | Bool[Array, ""]) -> Guards:
-    """Guards at a velocity: of a corner's two conditions the one that came last or, if contact ends, that goes first.
-
-    The conditions move along straight lines; if neither passes zero, the one that is closer to it is the guard.
-    """
+    """Guards at a velocity: of a corner's conditions the one that came last or, if contact ends, that goes first."""
     weights, members = guard_rows(model, data)
     rows: Any = data._impl
     first = members.argmax(axis=1) if len(members) else np.zeros(0, int)
-    distance, normals = (rows.efc_pos - rows.efc_margin)[first], jnp.asarray(weights, rows.efc_J.dtype)
-    types = np.asarray(model.geom_type)
-    if not len(rows.contact.dim) or not (np.any(types == _PLANE) and np.any(np.isin(types, _CONVEX))):
-        return Guards(distance, normals, jnp.zeros(len(members), bool))
-    limits, geom = rows.nl, rows.contact.geom
-    gaps, of_gaps, both = distance[limits:], normals[limits:], jnp.asarray(types)[geom]
-    has_skin = (both[:, 0] == _PLANE) & ((both[:, 1] == _CONVEX[0]) | (both[:, 1] == _CONVEX[1]))
-    same = jnp.all(geom[:, None] == geom[None], axis=2)
-    among = jnp.where(same, gaps, jnp.inf)
-    heights, of_heights = gaps - jnp.min(among, axis=1) - SKIN, of_gaps - of_gaps[jnp.argmin(among, axis=1)]
-
-    def time(distance: Array, weights: Array) -> Array:
-        speed = jnp.where(ends, -1.0, 1.0) * (weights @ (rows.efc_J @ qvel))
-        return jnp.where(speed < 0, jnp.abs(distance / jnp.where(speed < 0, speed, 1.0)), jnp.inf)
-
-    since_gap, since_height = time(gaps, of_gaps), time(heights, of_heights)
-    never = jnp.isinf(since_gap) & jnp.isinf(since_height)
-    deep = has_skin & (gaps < 0) & jnp.where(never, heights > gaps, since_height < since_gap)
-    distance = distance.at[limits:].set(jnp.where(deep, heights, gaps))
-    normals = normals.at[limits:].set(jnp.where(deep[:, None], of_heights, of_gaps))
-    return Guards(distance, normals, jnp.zeros(len(members), bool).at[limits:].set(deep))
+    weights, members = (jnp.asarray(each, rows.efc_J.dtype) for each in (weights, members))
+    distance, speed = (rows.efc_pos - rows.efc_margin)[first], weights @ (rows.efc_J @ qvel)
+    none = jnp.zeros(len(members), bool)
+    pairs = [corners(model, data, qvel, ends, pair) for pair in corner_pairs(model)]
+    if not pairs:
+        return Guards(distance, speed, lambda guard: weights[guard] @ rows.efc_J, weights, members, none)
+    found: Corners = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pairs)
+    limits, both = rows.nl, jnp.asarray(np.asarray(model.geom_type))[rows.contact.geom]
+    replaced = (both[:, 0] == PLANE) & ((both[:, 1] == CONVEX[0]) | (both[:, 1] == CONVEX[1]))
+    inserted = lambda every, those: jnp.concatenate([every[:limits], those, every[limits:]])  # noqa: E731
+    distance = distance.at[limits:].set(jnp.where(replaced, jnp.maximum(distance[limits:], 1.0), distance[limits:]))
+    slopes = inserted(weights @ rows.efc_J, found.slopes)
+    return Guards(
+        inserted(distance, found.distance),
+        inserted(speed, found.speed),
+        lambda guard: slopes[guard],
+        inserted(weights, (found.slots - found.opposite) @ weights[limits:]),
+        inserted(members, found.slots @ members[limits:]),
+        inserted(none, found.deep),
+    )
 
 
 class Points(NamedTuple):
@@ -132,19 +132,16 @@ def motion(
     model: mjx.Model, data: mjx.Data, qvel: Qvel, ends: bool | Bool[Array, ""]
 ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
     """Distance of every guard [m or rad], and its rate at a velocity [m/s or rad/s]."""
-    rows: Any = data._impl
     found = find_guards(model, data, qvel, ends)
-    return found.distance, found.weights @ (rows.efc_J @ qvel)
+    return found.distance, found.speed
 
 
 def course(model: mjx.Model, data: mjx.Data, qvel: Qvel, after: Qvel, qacc: Qvel) -> Course:
     """Course of the guards in a step from velocity `qvel` to velocity `after`, with acceleration `qacc`."""
-    _, members = guard_rows(model, data)
     rows: Any = data._impl
     force = jnp.abs(row_force(model, data, rows.efc_J @ qacc - rows.efc_aref))
-    pushes = jnp.asarray(members, force.dtype) @ force > 0
-    moves = motion(model, data, qvel, ends=False), motion(model, data, after, ends=True)
-    return Course(*moves[0], *moves[1], pushes, contact_points(model, data))
+    found, leaving = find_guards(model, data, qvel, ends=False), motion(model, data, after, ends=True)
+    return Course(found.distance, found.speed, *leaving, found.members @ force > 0, contact_points(model, data))
 
 
 def contact_points(model: mjx.Model, data: mjx.Data) -> Points | None:

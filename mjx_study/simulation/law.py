@@ -87,6 +87,10 @@ class Law(ABC):
     def step(self, scene: Scene, model: "LawModel", qpos: Array, qvel: Array, act: Array, control: Array) -> Step:
         """Advance by one timestep; differentiable in both modes."""
 
+    def lead(self, solref: tuple[float, float], d_width: float, timestep: float) -> float:
+        """Time before touch, at constant velocity, from which the law acts [s]; 0 if from touch on."""
+        return 0.0
+
     def equations(self, scene: Scene) -> "Equations | None":
         """The equation that the acceleration solves, and the step at any; None if only `step` has the derivative."""
         return None
@@ -154,6 +158,13 @@ class MujodicoLaw(Law):
         gap = terms[0] - data.qfrc_smooth - data.qfrc_constraint
         residual = _norm(gap) / (sum(map(_norm, terms)) + jnp.finfo(qvel.dtype).tiny)
         return *self._integrated(scene, theirs, data), data.qacc, residual
+
+    def lead(self, solref: tuple[float, float], d_width: float, timestep: float) -> float:
+        if self.name == "hunt_crossley":
+            return 2 * timestep
+        first, second = solref
+        tau = d_width * (second / first if first < 0 else 2 * first * second**2)
+        return timestep + tau
 
     def equations(self, scene: Scene) -> Equations | None:
         """None where impulses are no functions of the velocity after the step: the cone's at limits and equalities."""

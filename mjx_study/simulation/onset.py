@@ -331,12 +331,14 @@ class GuardAtTouch(NamedTuple):
     """A guard that passes zero.
 
     Attributes:
+        normal: derivative of its distance.
         weights, deep: as in `guards.Guards`.
         members: the rows that begin or end with it.
         absent: rows of the event's `absent` guards.
         touching: rows without penetration.
     """
 
+    normal: Qvel
     weights: Rows
     deep: Bool[Array, ""]
     members: Rows
@@ -347,11 +349,10 @@ class GuardAtTouch(NamedTuple):
 def guard_at(model: mjx.Model, positioned: mjx.Data, qvel: Qvel, event: Events) -> GuardAtTouch:
     """The guard of an event, at the position stage of its touch and the velocity with which it moves there."""
     found = guards.find_guards(model, positioned, qvel, event.ends)
-    _, members = guards.guard_rows(model, positioned)
-    members = jnp.asarray(members, found.weights.dtype)
-    absent, touching = (each.astype(members.dtype) @ members for each in (event.absent, event.touching & ~found.deep))
+    flags, members = (event.absent, event.touching & ~found.deep), found.members
+    absent, touching = (each.astype(members.dtype) @ members for each in flags)
     weights, deep = found.weights[event.guard], found.deep[event.guard]
-    return GuardAtTouch(weights, deep, members[event.guard], absent, touching)
+    return GuardAtTouch(found.slopes(event.guard), weights, deep, members[event.guard], absent, touching)
 
 
 class Passages(NamedTuple):
@@ -393,7 +394,6 @@ def passages(
     """
     positioned = fwd_position(model, template.replace(qpos=qpos))
     guard = guard_at(model, positioned, closing, event)
-    rows: Any = positioned._impl
     forced = force_stage(model, positioned, qvel, act, control)
     touching = guards.at_first_touch(model, forced, guard.touching)
 
@@ -406,7 +406,7 @@ def passages(
     qvel, act, qacc = (jnp.stack(each) for each in zip(on, off, strict=True))
     damper, spring = guards.relaxation_rates(model, positioned.replace(qvel=closing), guard.weights)
     rate = jnp.maximum(damper, spring)
-    return Passages(qvel, act, qacc, guard.weights @ rows.efc_J, rate, spring, guard.deep)
+    return Passages(qvel, act, qacc, guard.normal, rate, spring, guard.deep)
 
 
 def least_travel(model: mjx.Model, found: Passages, ends: Bool[Array, ""]) -> Scalar:

@@ -98,7 +98,7 @@ def turned_quaternion(
     return rotate_quaternion(quaternion, timestep * velocity)
 
 
-def _module(name: str) -> Any:
+def mjx_module(name: str) -> Any:
     """A module of MJX's implementation, or the package `mujoco.mjx` for the empty name."""
     return sys.modules[f"{mjx.make_constraint.__module__.rpartition('.')[0]}.{name}"] if name else mjx
 
@@ -222,7 +222,7 @@ _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("smooth", "factor_m"): factored_inertia,
     ("smooth", "solve_m"): solved_inertia,
 }
-_ORIGINAL: Final[dict[Place, Any]] = {place: getattr(_module(place[0]), place[1], None) for place in _REPLACED}
+_ORIGINAL: Final[dict[Place, Any]] = {place: getattr(mjx_module(place[0]), place[1], None) for place in _REPLACED}
 """MJX's own functions; `patched` checks that there are all of them."""
 AT_FIRST_TOUCH: Final = {("constraint", "_kbi"): _touching}
 """Gives every active constraint row its values at first touch."""
@@ -253,7 +253,7 @@ def patched(also: Mapping[Place, Callable[..., Any]] = MappingProxyType({})) -> 
 
 
 def _branch_at(module_name: str, name: str) -> None:
-    module = _module(module_name)
+    module = mjx_module(module_name)
     original = getattr(module, name, None)
     if original is None:
         raise RuntimeError(f"this version of MJX has no {module.__name__}.{name}: adapt patches.py to it")

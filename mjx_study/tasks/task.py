@@ -26,16 +26,18 @@ class Recipe:
     """Default settings for the optimisation of a task.
 
     Attributes:
-        learning_rate: learning rate of plain gradient descent.
+        learning_rate: learning rate of the optimiser.
         iterations: number of descent steps.
         samples: batch size of the gradient estimate at each step.
         decay: exponent a of the learning-rate decay, learning_rate / i^a at iteration i = 1, 2, ...
+        optimizer: name of an optimiser of optax; "sgd" is plain gradient descent.
     """
 
     learning_rate: float
     iterations: int
     samples: int
     decay: float = 0.0
+    optimizer: str = "sgd"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +71,7 @@ class StudyDefaults:
             the resistance to slip.
         gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default (inverse-variance weighting).
         published: AoBG's constants in the published example, or None.
-        recipe: settings of gradient descent; None if they must all be given.
+        recipe: settings of descents; None if they must all be given.
         span: range of a landscape over a scalar parameter; None for a range about theta.
     """
 

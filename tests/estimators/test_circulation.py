@@ -1,5 +1,6 @@
 """The integral of a mean along a path against the difference of F: right, biased, undecided, and with what power."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -47,6 +48,16 @@ def test_a_jump_is_found_without_a_reference_gradient() -> None:
     assert results["fobg"].verdict() == "biased"
     np.testing.assert_allclose(results["fobg"].gap, -results["fobg"].difference, rtol=1e-12)
     assert results["zobg"].verdict(0.2) == "right"
+    assert results["fobg"].largest == 1.0
+
+
+def test_few_samples_with_tiny_gaps_are_right_and_never_biased() -> None:
+    found = check("fobg", objectives.quadratic(HESSIAN, 0.3))
+    size = abs(found.difference)
+    few = dataclasses.replace(found, gap=1e-6 * size, standard_error=1e-7 * size, effective=jnp.ones(()))
+    for largest, expected in ((1e-5, "right"), (1.0, "undecided")):
+        assert dataclasses.replace(few, largest=largest * size).verdict() == expected
+    assert dataclasses.replace(few, gap=0.06 * size, largest=0.04 * size).verdict() == "undecided"
 
 
 def test_few_samples_decide_nothing() -> None:
