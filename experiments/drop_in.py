@@ -9,6 +9,7 @@ A few minutes on one core, most of it compiling. Stock's gradient is of one solv
 import argparse
 import statistics
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -54,7 +55,7 @@ def prepared(
     gradient: bool,
     batch: int,
     control: np.ndarray | None = None,
-) -> Callable[[], Any]:
+) -> partial[Any]:
     """Compile a batch of rollouts of `STEPS` steps, or their gradients over initial velocity and controls, to be called
     without arguments; its result is the last positions, or the gradients. The control is 0 by default."""
     model, data = mjx.put_model(host), mjx.make_data(host)
@@ -72,7 +73,11 @@ def prepared(
 
     each = jax.grad(last, argnums=(0, 1), has_aux=True) if gradient else last
     compiled = jax.jit(jax.vmap(lambda *inputs: each(*inputs)[0 if gradient else 1])).lower(*inputs).compile()
-    return lambda: jax.block_until_ready(compiled(*inputs))
+    return partial(_finished, compiled, inputs)
+
+
+def _finished(program: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
+    return jax.block_until_ready(program(*inputs))
 
 
 def measured(path: Path, batch: int) -> dict[str, float]:

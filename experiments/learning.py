@@ -334,6 +334,20 @@ def table(lines: list[dict[str, Any]], name: str) -> str:
     return markdown_table(rows, HEADINGS)
 
 
+def grid_table(lines: list[dict[str, Any]], name: str) -> str:
+    """Mean final cost of each setting's seeds, and the setting: Adam's learning rate, and the adjoint's window."""
+    rows = []
+    for line in lines:
+        if (line["what"], line["task"]) == ("tune", name):
+            windows = {window for _, window in line["pairs"]}
+            cells = [
+                f"{np.mean(final):.2f} ({rate:.2g}{f', {window:g}/{PIECES[name]}' if len(windows) > 1 else ''})"
+                for (rate, window), final in zip(line["pairs"], line["final"], strict=True)
+            ]
+            rows.append((f"`{line['method']}`", *cells))
+    return markdown_table(sorted(rows), ["method", *map(str, range(1, 10))])
+
+
 def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:
     half = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
     return f"{np.mean(values):.3f} ± {half:.3f}"
@@ -342,7 +356,8 @@ def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:
 def report(path: str) -> None:
     """Write the tables of docs/robots.md and its figure."""
     lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
-    write_tables(DOCS / "robots.md", {name: table(lines, name) for name in TASKS})
+    tables = {name: table(lines, name) for name in TASKS}
+    write_tables(DOCS / "robots.md", tables | {f"{name}, grid": grid_table(lines, name) for name in TASKS})
     figure(lines).savefig(DOCS / "learning.png")
 
 

@@ -5,9 +5,10 @@
 
 Each route rolls out `STEPS` steps from states in contact, under the control that holds them there, solved to rounding
 (`BUDGET`), but for stock MJX's gradients, which one iteration of its solver gives. Rates are those of the fastest of
-several calls, with the inputs on the device.
-Building is the time to the first result of a process with empty caches, tracing included: of rollouts, then of their
-gradients. What takes a route longer than `MOST_SECONDS` is left out.
+several calls, with the inputs on the device. Gradients by the C engine are one rollout's on one thread, by centred
+differences of every step (`mjd_transitionFD`) and an adjoint sweep, times the threads. Memory is XLA's plan
+for a batch. Building is the time to the first result of a process with empty caches, tracing included: of rollouts,
+then of their gradients. What takes a route longer than `MOST_SECONDS` is left out.
 """
 
 import argparse
@@ -15,7 +16,6 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +31,8 @@ from experiments.drop_in import STEPS, TESTED, prepared, start_states
 from experiments.native import keep, number
 from experiments.pages import write_tables
 from experiments.timing import interleaved
+from mjx_study.bench import gradient_of_engine
+from mjx_study.graph.function import ScalarFunction
 from mjx_study.graph.linear_map import implicit_derivative
 from mjx_study.graph.scalars import captured_once
 from mjx_study.runtime import available_cores
@@ -54,6 +56,7 @@ COLUMNS: Final = {
     ("stock", "rollouts"): ("stock MJX", "rollouts"),
     ("stock", "gradients"): ("stock MJX", "gradients, one iteration"),
     ("engine", "rollouts"): ("C engine", "rollouts"),
+    ("engine", "gradients"): ("C engine", "gradients by differences"),
 }
 BUDGET: Final = (100, 50)
 """Iterations of the solver and of its line search."""
@@ -63,9 +66,9 @@ MOST_SECONDS: Final = 900
 REPEATS: Final = 7
 
 
-def loaded(name: str) -> mujoco.MjModel:
+def loaded(path: Path) -> mujoco.MjModel:
     """A robot with a budget that does not end its solver."""
-    host = mujoco.MjModel.from_xml_path(str(ROBOTS[name]))
+    host = mujoco.MjModel.from_xml_path(str(path))
     host.opt.iterations, host.opt.ls_iterations = BUDGET
     return host
 
@@ -78,26 +81,26 @@ def standing(host: mujoco.MjModel) -> np.ndarray:
 def measure(name: str, route: str) -> None:
     """Print, after each kind of program, million steps per second and seconds to the first result of all so far."""
     mjx_study.configure()
-    host, platform = loaded(name), jax.default_backend()
+    host, platform = loaded(ROBOTS[name]), jax.default_backend()
     size, found = SAMPLES[platform], dict[str, Any]()
     step = mjx.step if route == "stock" else mjx_study.step
     for kind in ("rollouts", "gradients"):
         begun, gradient = time.perf_counter(), kind == "gradients"
         if route == "engine":
-            call = by_engine(host, size)
+            call, memory = differences_by_engine(host) if gradient else by_engine(host, size), None
         else:
             iterations = 1 if gradient and route == "stock" else BUDGET[0]
             call = prepared(host, step, iterations, gradient, size, standing(host))
+            memory = call.args[0].memory_analysis().temp_size_in_bytes / size
         call()
         built = time.perf_counter() - begun
         best = min(interleaved({kind: call}, REPEATS)[kind])
-        found[kind] = {"rate": size * STEPS / best / 1e6, "built": built}
+        together = available_cores() if route == "engine" and gradient else size
+        found[kind] = {"rate": together * STEPS / best / 1e6, "built": built, "bytes": memory}
         print(json.dumps({"platform": platform, "samples": size, "found": found}), flush=True)
-        if route == "engine":
-            return
 
 
-def by_engine(host: mujoco.MjModel, batch: int) -> Callable[[], Any]:
+def by_engine(host: mujoco.MjModel, batch: int) -> partial[Any]:
     """The same rollouts in MuJoCo's C engine, on all of this process's cores."""
     data = [mujoco.MjData(host) for _ in range(available_cores())]
     qpos, qvel = start_states(host, batch)
@@ -108,18 +111,30 @@ def by_engine(host: mujoco.MjModel, batch: int) -> Callable[[], Any]:
     return partial(run.rollout, host, data, start, controls)
 
 
-def sizes(name: str) -> dict[str, int]:
-    """Degrees of freedom, constraint rows, and scalar operations of a robot's step and its transposed derivative."""
-    host = loaded(name)
-    model, data = mjx.put_model(host), mjx.make_data(host)
-    rows: Any = data._impl
-    paths, structure = jax.tree_util.tree_flatten_with_path(data)
-    names = [jax.tree_util.keystr(path) for path, _ in paths]
-    kinds = tuple(jax.ShapeDtypeStruct(np.shape(leaf), jax.typeof(leaf).dtype) for _, leaf in paths)
+def differences_by_engine(host: mujoco.MjModel) -> partial[Any]:
+    """The gradient of one such rollout by the C engine, on one thread."""
+    qpos, qvel = start_states(host, 1)
+    return partial(gradient_of_engine, host, (qpos[0], qvel[0]), np.tile(standing(host), (STEPS, 1)))
+
+
+def solved_step(model: mjx.Model, data: mjx.Data) -> tuple[ScalarFunction, native_step.Layout]:
+    """The graph of a step."""
+    leaves, structure = jax.tree.flatten(data)
+    kinds = tuple(jax.ShapeDtypeStruct(np.shape(leaf), jax.typeof(leaf).dtype) for leaf in leaves)
     solved = captured_once(native_step._solved, model, structure.unflatten(kinds))
     assert solved is not None
-    used = tuple(solved.used)
-    equations = partial(native_step._equations, (structure, kinds, used))
+    return solved, (structure, kinds, tuple(solved.used))
+
+
+def sizes(name: str) -> dict[str, int]:
+    """Degrees of freedom, constraint rows, and scalar operations of a robot's step and its transposed derivative."""
+    host = loaded(ROBOTS[name])
+    model, data = mjx.put_model(host), mjx.make_data(host)
+    rows: Any = data._impl
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(data)]
+    solved, layout = solved_step(model, data)
+    _, kinds, used = layout
+    equations = partial(native_step._equations, layout)
     qacc = jax.ShapeDtypeStruct((host.nv,), float)
     captured = captured_once(equations, model, *(kinds[place] for place in used), qacc)
     assert captured is not None
@@ -157,7 +172,7 @@ def write_page() -> None:
     """Write the tables of docs/robots.md, from the last measurement of each robot, route and platform."""
     rows = {(each["platform"], each["robot"], each["route"]): each["found"] for each in map(json.loads, open(RESULTS))}
     header = [f"{what}: {kind}" for what, kind in (*COLUMNS.values(), ("building [s]", "native"))]
-    tables = {}
+    tables = dict[str, str]()
     for platform in sorted({platform for platform, *_ in rows}):
         lines = []
         for name in ROBOTS:
@@ -168,6 +183,11 @@ def write_page() -> None:
         columns = [each for each in zip(["robot", *header], *lines, strict=True) if {*each[1:]} != {"-"}]
         names, *lines = map(list, zip(*columns, strict=True))
         tables[f"speed, {platform}"] = markdown_table(lines, names)
+    lines = []
+    for name in ROBOTS:
+        found = [rows.get(("cpu", name, route), {}).get("gradients", {}) for route in ("native", "xla", "stock")]
+        lines.append([f"`{name}`", *(number(each.get("bytes", math.nan) / 1e3) for each in found)])
+    tables["memory"] = markdown_table(lines, ["robot", "native", "through XLA", "stock MJX, one iteration"])
     found = {name: sizes(name) for name in ROBOTS}
     lines = [[f"`{name}`", *(f"{size:,}" for size in each.values())] for name, each in found.items()]
     write_tables(DOCS / "robots.md", tables | {"size": markdown_table(lines, ["robot", *found["quadruped"]])})

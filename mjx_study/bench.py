@@ -295,7 +295,13 @@ def engine_gradient(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of the final state's sum over initial state and controls, by centred differences of each of the C
     engine's steps and one adjoint sweep."""
-    host = engine_model(task.scene, contact)
+    return gradient_of_engine(engine_model(task.scene, contact), start, controls)
+
+
+def gradient_of_engine(
+    host: mujoco.MjModel, start: tuple[np.ndarray, np.ndarray], controls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`engine_gradient` of a model."""
     data = mujoco.MjData(host)
     data.qpos[:], data.qvel[:] = start
     size = 2 * host.nv + host.na

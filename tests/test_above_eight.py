@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.drop_in import MODELS
+from experiments.values import EDGES, compared
 from mjx_study.graph import operation, scalars
 from mjx_study.graph.build import known_libraries
 from mjx_study.graph.native import SWITCH, native_identity, native_summary
@@ -249,7 +250,7 @@ def test_a_ball_on_a_height_field(monkeypatch: pytest.MonkeyPatch) -> None:
         return jnp.sum(qvel**2), qvel
 
     found = []
-    for switch in "10":
+    for switch in ("1", "xla"):
         monkeypatch.setenv(SWITCH, switch)
         found.append(jax.jit(jax.vmap(jax.value_and_grad(speed, has_aux=True)))(qpos))
     ((_, qvel), slopes), ((_, expected), expected_slopes) = found
@@ -259,6 +260,26 @@ def test_a_ball_on_a_height_field(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.mean(same[touching]) > 0.9 and np.all(same[~touching])
     scale = np.max(np.abs(expected_slopes))
     np.testing.assert_allclose(slopes[same], expected_slopes[same], rtol=0, atol=1e-8 * scale)
+
+
+@pytest.mark.parametrize(
+    ("name", "to_engine"),
+    [
+        ("quadruped", 1e-11),
+        pytest.param("arm", 1e-11, marks=pytest.mark.slow),
+        pytest.param("humanoid", 1e-11, marks=pytest.mark.slow),
+        pytest.param("barkour_v0", 2e-5, marks=pytest.mark.slow),
+        pytest.param(EDGES, 1e-11, marks=pytest.mark.slow),
+    ],
+)
+def test_steps_and_derivatives_are_those_of_stock_mjx(name: str, to_engine: float) -> None:
+    """From states in contact, and in the C engine's distance, which MJX's edges of height fields make larger."""
+    found = compared(name, 8, path=0)
+    assert np.mean(np.array(found["contacts"]["ours"]) > 0) > 0.5
+    assert found["contacts"]["ours"] == found["contacts"]["stock"] == found["contacts"]["engine"]
+    assert max(found["step"]["ours - stock"]) < 1e-11 and max(found["slopes"]) < 1e-6
+    assert max(found["step"]["ours - engine"]) < to_engine
+    assert name != "barkour_v0" or max(found["step"]["ours - engine"]) > 1e-8
 
 
 def quadruped_of_mjx() -> Scene:

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import pytest
 
+from mjx_study.graph.native import computes_steps
 from tests.processes import ROOT, run_script
 
 SCRIPT = """
@@ -60,7 +61,10 @@ def builds_of(folder: Path, *commands: str) -> list[dict[str, list[str]]]:
 
 
 def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
-    """The second command is another one, on the same task, with other samples and seeds."""
+    """The second command is another one, on the same task, with other samples and seeds.
+
+    Through XLA, other numbers of samples are other chunks, which are other programs.
+    """
     (tmp_path / "mine.py").write_text("from tests.carts import cart\n")
     compare = "compare mine:cart --contact mjcf --samples 20 --reference-samples 20"
     optimise = "optimise mine:cart --iterations 2 --samples 8 --learning-rate 0.1 --evaluation-samples 20 --seeds 2"
@@ -81,9 +85,10 @@ def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
         large = [name for name in found["built"] if name in LARGE]
         descents_of_three_estimators = 2 * ("descent" in large)
         assert len(large) == len(set(large)) + descents_of_three_estimators, large
-    assert again["built"] == others["built"] == later["built"] == more["built"] == []
+    native = computes_steps() != "XLA"
+    assert again["built"] == later["built"] == [] and (not native or others["built"] == more["built"] == [])
     assert first["traced"] and descents["traced"]
-    for found in (again, others, line, later, more):
+    for found in (again, later, *((others, line, more) if native else ())):
         assert not LARGE & {*found["built"]} and not found["traced"], found
     assert {name for name in descents["built"] if name in LARGE} == {"descent"}
 

@@ -14,6 +14,8 @@ from mjx_study.graph.indexing import FEWEST_ROWS
 from mjx_study.graph.native import SWITCH
 from mjx_study.graph.scalars import traced_part, unrolled
 
+ROUTES = [pytest.param("1", id="C"), pytest.param("0", id="NumPy"), pytest.param("xla", id="operations")]
+
 TABLE = np.arange(12.0).reshape(4, 3) - 5
 ROW = np.array([0.3, -1.2, 2.5])
 FIELD = np.sin(np.arange(300.0)).reshape(20, 15)
@@ -131,7 +133,7 @@ def _looked_up(x):
 FUNCTIONS["computed indices of large arrays"] = _looked_up
 
 
-@pytest.mark.parametrize("native", [pytest.param("1", id="native"), pytest.param("0", id="operations")])
+@pytest.mark.parametrize("native", ROUTES)
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_the_value_is_the_functions(name, native, monkeypatch):
     monkeypatch.setenv(SWITCH, native)
@@ -242,7 +244,7 @@ def _one_term(x):
     return jnp.sum(jnp.zeros(3).at[1].set(-x))
 
 
-@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize("native", ROUTES)
 @pytest.mark.parametrize(
     "function",
     [

@@ -31,7 +31,8 @@ def test_windows_cut_the_adjoint_and_nothing_else(monkeypatch: pytest.MonkeyPatc
 def test_the_page_has_the_tables_of_the_data() -> None:
     lines = [json.loads(line) for line in (DATA / "learning.jsonl").read_text().splitlines()]
     for name in learning.TASKS:
-        assert learning.table(lines, name) in (DOCS / "robots.md").read_text()
+        for written in (learning.table, learning.grid_table):
+            assert written(lines, name) in (DOCS / "robots.md").read_text()
     assert learning.best(lines, "walk", "fobg_onset") == [0.01, 8]
     assert learning.best(lines, "hopper", "fobg_onset")[0] > 2 * learning.best(lines, "hopper", "fobg")[0]
 

@@ -18,17 +18,14 @@ from mjx_study.graph.function import Passes, ScalarFunction, depending_on
 from mjx_study.graph.nodes import Node, depth_first, entries_of, no_type_check
 from mjx_study.graph.parts import Loop, Statement, in_parts
 
-_OPERATORS: Final = {
-    **{"add": "+", "add_any": "+", "sub": "-", "mul": "*", "and": "&", "or": "|", "xor": "^"},
-}
 COMPARISONS: Final = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
-_FUNCTIONS: Final = frozenset(
-    (
-        *("abs", "acos", "asin", "atan", "atan2", "ceil", "cos", "cosh", "erf", "exp", "expm1", "floor", "log"),
-        *("log1p", "max", "min", "rem", "sign", "sin", "sinh", "sqrt", "tan", "tanh"),
-    )
-)
-"""Operations that the prelude has as functions, by type."""
+_FORMS: Final = {
+    **{"add": "{0} + {1}", "add_any": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "square": "{0} * {0}"},
+    **{"and": "{0} & {1}", "or": "{0} | {1}", "xor": "{0} ^ {1}", "neg": "-{0}", "not": "~{0}"},
+    **{"rsqrt": "1 / sqrt_{kind}({0})", "logistic": "1 / (1 + exp_{kind}(-{0}))"},
+    "clamp": "min_{kind}(max_{kind}({1}, {0}), {2})",
+}
+"""Expressions of operations; others are functions of the prelude, by type, or written by `Writer`."""
 _TYPES: Final = (*("float64", "float32", "int64", "int32", "int16", "int8", "uint64", "uint32", "uint16", "uint8"),)
 NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for name in _TYPES} | {np.dtype(bool): "mask"}
 
@@ -271,30 +268,27 @@ class Writer:
                 case "output":
                     (loop,), (place, _) = node.arguments, node.parameters
                     self._names[node.number] = self._names[loop.parameters[0][place].number]
-                case "entry":
-                    index, first = node.arguments
-                    (place, at), kind = self._places[first.number], _type(node.dtype)
-                    where = f"{place}, {at} + {node.parameters} * {self._value(index)}"
-                    line = f"{kind} x{node.number} = ENTRY({kind}, {where});"
-                    found.append(self._statement([line], {node.number: kind}))
-                case "table":
-                    kind, (index,) = _type(node.dtype), node.arguments
-                    table = self.constant_vectors.setdefault(
-                        (kind, tuple(node.parameters.tolist())), f"table{len(self.constant_vectors)}"
-                    )
-                    line = f"{kind} x{node.number} = TABLE({kind}, {table}, {self._value(index)});"
-                    self.dtypes.add(node.dtype)
-                    found.append(self._statement([line], {node.number: kind}))
                 case "whole":
                     raise NotWrittenError(node.parameters[0].primitive.name)
-                case primitive:
-                    self.dtypes.add(node.dtype)
+                case operation:
                     kind = _type(node.dtype)
-                    line = f"{kind} x{node.number} = {self._expression(primitive.name, node)};"
+                    self.dtypes.add(node.dtype)
+                    read = isinstance(operation, str)
+                    value = self._read(kind, node) if read else self._expression(node)
+                    line = f"{kind} x{node.number} = {value};"
                     lines, self._before = [*self._before, line], []
                     found.append(self._statement(lines, {node.number: kind}))
             found += self._stored(node.number, self._names[node.number])
         return found
+
+    def _read(self, kind: str, node: Node) -> str:
+        """An entry at a computed index of an input, or of a constant vector."""
+        index = self._value(node.arguments[0])
+        if node.operation == "entry":
+            place, at = self._places[node.arguments[1].number]
+            return f"ENTRY({kind}, {place}, {at} + {node.parameters} * {index})"
+        known, entries = self.constant_vectors, tuple(node.parameters.tolist())
+        return f"TABLE({kind}, {known.setdefault((kind, entries), f'table{len(known)}')}, {index})"
 
     def _loop(self, node: Node) -> list[Statement | Loop]:
         carried, again, after = node.parameters
@@ -316,7 +310,8 @@ class Writer:
         self._names = outside
         return [begin, Loop(test, node.number, body)]
 
-    def _expression(self, name: str, node: Node) -> str:
+    def _expression(self, node: Node) -> str:
+        name = node.operation.name
         values = [self._value(each) for each in node.arguments]
         (first, *others), kind, parameters = values, _type(node.dtype), node.parameters or {}
         of = node.arguments[0].dtype
@@ -326,45 +321,31 @@ class Writer:
                 return f"MASK({first} {signs[name]} {others[0]})"
             case "max" | "min" if kind == "mask":
                 return f"{first} {'|' if name == 'max' else '&'} {others[0]}"
-            case _ if name in _OPERATORS:
-                return f"{first} {_OPERATORS[name]} {others[0]}"
             case "div":
                 return f"{first} / {others[0]}" if node.dtype.kind == "f" else f"div_{kind}({first}, {others[0]})"
             case "abs" if node.dtype.kind in "iu":
                 return first if node.dtype.kind == "u" else f"max_{kind}({first}, -{first})"
-            case _ if name in _FUNCTIONS:
-                return f"{name}_{kind}({', '.join(values)})"
             case "shift_left" | "shift_right_logical" if not isinstance(node.arguments[1], Node) and kind[0] == "u":
                 return f"{first} {'<<' if name == 'shift_left' else '>>'} {others[0]}"
             case "bitcast_convert_type" if "mask" not in (kind, _type(of)):
                 return f"BITS({kind}, {first})"
-            case "neg":
-                return f"-{first}"
-            case "not":
-                return f"~{first}"
-            case "square":
-                return f"{first} * {first}"
+            case "shift_left" | "shift_right_logical" | "bitcast_convert_type":
+                raise NotWrittenError(name)
             case "integer_pow":
                 return self._power(first, parameters["y"], node)
             case "pow":
                 exponent = others[0] if node.arguments[1].dtype == node.dtype else f"AS({kind}, {others[0]})"
                 return f"pow_{kind}({first}, {exponent})"
-            case "rsqrt":
-                return f"1 / sqrt_{kind}({first})"
-            case "logistic":
-                return f"1 / (1 + exp_{kind}(-{first}))"
             case "round":
                 even = parameters["rounding_method"] == lax.RoundingMethod.TO_NEAREST_EVEN
                 return f"{'rint' if even else 'round'}_{kind}({first})"
             case "is_finite":
                 return f"MASK(abs_{_type(of)}({first}) < INFINITY)"
-            case "clamp":
-                return f"min_{kind}(max_{kind}({others[0]}, {first}), {others[1]})"
             case "select_n":
                 return self._selection(node.arguments[0], values, _select(node.dtype))
             case "convert_element_type":
                 return _converted(first, np.dtype(of), node.dtype)
-        raise NotWrittenError(name)
+        return _FORMS[name].format(*values, kind=kind) if name in _FORMS else f"{name}_{kind}({', '.join(values)})"
 
     def _power(self, base: str, exponent: int, node: Node) -> str:
         """Multiply by repeated squaring, like XLA."""

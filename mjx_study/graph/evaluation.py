@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,26 +13,6 @@ from jax.extend.core import jaxpr_as_fun
 
 from mjx_study.graph.function import ScalarFunction, array_of, bind_whole
 from mjx_study.graph.nodes import Node, needed_for, no_type_check
-
-_FUNCTIONS: Final = {
-    lax.add_p: lax.add,
-    lax.and_p: lax.bitwise_and,
-    lax.div_p: lax.div,
-    lax.eq_p: lax.eq,
-    lax.gt_p: lax.gt,
-    lax.lt_p: lax.lt,
-    lax.max_p: lax.max,
-    lax.min_p: lax.min,
-    lax.mul_p: lax.mul,
-    lax.ne_p: lax.ne,
-    lax.neg_p: lax.neg,
-    lax.not_p: lax.bitwise_not,
-    lax.or_p: lax.bitwise_or,
-    lax.select_n_p: lax.select_n,
-    lax.sqrt_p: lax.sqrt,
-    lax.sub_p: lax.sub,
-}
-"""Functions for operations that rules add; they supply the primitive parameters of the installed JAX version."""
 
 
 def evaluated(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
@@ -78,8 +58,10 @@ def _emit(nodes: Iterable[Node], values: dict[int, Any]) -> None:
                 found = _emit_loop(node, arguments, values)
             case primitive if node.parameters:
                 found = primitive.bind(*arguments, **node.parameters)
-            case primitive:
-                found = _FUNCTIONS.get(primitive, primitive.bind)(*arguments)
+            case primitive:  # that rules add: JAX's functions supply the parameters of the installed version
+                name = primitive.name
+                function = getattr(lax, f"bitwise_{name}" if name in ("and", "not", "or") else name, primitive.bind)
+                found = function(*arguments)
         values[node.number] = found
 
 
