@@ -37,7 +37,8 @@ from experiments.figures.rollouts import INK
 from experiments.pages import DPI, write_tables
 from mjx_study.objective.cost import before_each_step, last_of, rollout_cost
 from mjx_study.plots.style import style_of
-from mjx_study.table import markdown_table
+from mjx_study.simulation.contact import ContactModel, effective_mass, family_model
+from mjx_study.table import markdown_table, number
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Task
 
@@ -47,7 +48,11 @@ METHODS: Final[dict[str, Estimator]] = {
     "fobg_onset": make_estimator("fobg_onset"),
     "ivw": make_estimator("ivw", baseline="leave_one_out"),
     "ivw_onset": make_estimator("aobg_onset", baseline="leave_one_out"),
+    "fobg_law": make_estimator("fobg"),
 }
+LAW: Final = "hunt_crossley"
+"""Contact law through which `fobg_law` learns, at the static stiffness of MuJoCo's default contact; its policies are
+tested in the default contact like all others."""
 TASKS: Final = {"walk": "experiments.quadruped:walk", "hopper": "experiments.hopper:hopper"}
 NETWORKS: Final = {"walk": (), "hopper": (32, 32)}
 """Hidden widths of the networks that replace the tasks' policies."""
@@ -75,10 +80,12 @@ class Pieces:
 
     Attributes:
         window: pieces between cuts of the adjoint.
+        contact: contact of the rollouts; None for the model's own.
     """
 
     task: Task
     window: Any
+    contact: ContactModel | None = None
 
     @property
     def num_params(self) -> int:
@@ -99,7 +106,7 @@ class Pieces:
 
         def advance(start, inputs):
             drawn, cut = inputs
-            cost, (states, _, residual, _) = rollout_cost(piece, theta, None, start, drawn, onset)
+            cost, (states, _, residual, _) = rollout_cost(piece, theta, self.contact, start, drawn, onset)
             score = None
             if scored:
                 score = task.policy.score(
@@ -146,12 +153,19 @@ def make(name: str) -> Task:
 OPTIMIZER: Final = optax.chain(optax.clip_by_global_norm(MOST_NORM), optax.scale_by_adam())
 
 
-def iteration(task: Task, estimator: Estimator):
+def law_contact(task: Task) -> ContactModel:
+    """The contact of `LAW` as stiff as MuJoCo's default, solref = (0.02, 1) and dmax = 0.95, is under a foot."""
+    mass = effective_mass(task.scene, "floor", "foot")
+    return family_model(LAW, task.scene, stiffness=mass / (0.95 * 0.02) ** 2, effective_mass=mass)
+
+
+def iteration(task: Task, method: str):
     """One iteration of all descents, as a function of (theta, optimiser's state, learning rate, window, key)."""
+    estimator, contact = METHODS[method], law_contact(task) if method == "fobg_law" else None
     rollouts = 1 if len(estimator.needs) == 1 and estimator.needs[0] != "pair" else 2
 
     def one(theta, state, rate, window, key):
-        batches = draw(estimator.needs, Pieces(task, window), theta, key, SAMPLES // rollouts)
+        batches = draw(estimator.needs, Pieces(task, window, contact), theta, key, SAMPLES // rollouts)
         estimate = estimator(batches)
         usable = jnp.all(jnp.isfinite(estimate.mean))
         updates, following = OPTIMIZER.update(jnp.where(usable, estimate.mean, 0.0), state, theta)
@@ -169,7 +183,7 @@ def descend(task: Task, method: str, settings: list[tuple[float, int, int]], ite
     keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(7), seed))(seeds)
     theta = jnp.broadcast_to(task.theta, (count, task.theta.size))
     state = jax.vmap(OPTIMIZER.init)(theta)
-    step = iteration(task, METHODS[method])
+    step = iteration(task, method)
     fold = jax.jit(jax.vmap(jax.random.fold_in, (0, None)))
     began = time.perf_counter()
     jax.block_until_ready(step(theta, state, rates, windows, fold(keys, 0)))
@@ -294,7 +308,11 @@ def figure(lines: list[dict[str, Any]]) -> Figure:
                 continue
             cost = np.concatenate([np.atleast_2d(each["cost"]) for each in seeds])
             label, colour, _ = style_of({"zobg": "zobg_antithetic", "ivw_onset": "aobg_onset"}.get(method, method))
-            label, colour = {"ppo": ("PPO", INK), "ivw_onset": ("IVW (onset)", colour)}.get(method, (label, colour))
+            label, colour = {
+                "ppo": ("PPO", INK),
+                "ivw_onset": ("IVW (onset)", colour),
+                "fobg_law": ("FoBG, Hunt-Crossley", "gold"),
+            }.get(method, (label, colour))
             rollouts = np.arange(1, cost.shape[1] + 1) * SAMPLES * ITERATIONS / cost.shape[1]
             times = np.mean([each["seconds"] for each in seeds], axis=0)
             for axes, along in ((left, rollouts), (right, times)):
@@ -340,8 +358,9 @@ def grid_table(lines: list[dict[str, Any]], name: str) -> str:
     for line in lines:
         if (line["what"], line["task"]) == ("tune", name):
             windows = {window for _, window in line["pairs"]}
+            share = f", {{:g}}/{PIECES[name]}" if len(windows) > 1 else ""
             cells = [
-                f"{np.mean(final):.2f} ({rate:.2g}{f', {window:g}/{PIECES[name]}' if len(windows) > 1 else ''})"
+                f"{number(float(np.mean(final)))} ({rate:.2g}{share.format(window)})"
                 for (rate, window), final in zip(line["pairs"], line["final"], strict=True)
             ]
             rows.append((f"`{line['method']}`", *cells))

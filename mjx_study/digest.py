@@ -47,6 +47,8 @@ IMPLIED: Final = frozenset(
     "__weakref__ _abc_impl _is_protocol".split()
 )
 """Attributes that say nothing beyond names and source."""
+LATER: Final = "later"
+"""Key in the metadata of fields that were added to a dataclass, so that digests of the version before are kept."""
 FORMER: Final = {
     "mjx_study.reference.projectiles": "mjx_study.reference.launch",
     "estimators.batches": "estimators.types",
@@ -281,10 +283,14 @@ def _slots(kind: type) -> set[str]:
 
 
 def _state(value: Any) -> dict[str, Any]:
-    """Attributes of an object, in its dictionary or in slots, except cached ones; of our dataclasses, the fields."""
+    """Attributes of an object, in its dictionary or in slots, except cached ones; of our dataclasses, the fields,
+    except those that came `LATER` and have their defaults."""
     kind = type(value)
     if dataclasses.is_dataclass(value) and by_version(kind.__module__):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        found = {field: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {
+            field.name: each for field, each in found.items() if not (LATER in field.metadata and each == field.default)
+        }
     held = {name: getattr(value, name) for name in _slots(kind) if hasattr(value, name)}
     own = {name: each for name, each in getattr(value, "__dict__", {}).items() if name not in IMPLIED}
     if (wrapped := getattr(value, "__wrapped__", None)) is not None:

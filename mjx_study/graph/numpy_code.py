@@ -160,7 +160,8 @@ def _looped(one_pass: Callable[..., tuple[Any, Values]], inputs: Values, carried
 
 
 def _divided(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return np.where(other == 0, -1, (one - np.fmod(one, other)) // np.where(other == 0, 1, other)).astype(one.dtype)
+    quotient = (one - np.fmod(one, other)) // np.where(other == 0, 1, other).astype(other.dtype)
+    return np.where(other == 0, ~one.dtype.type(0), quotient).astype(one.dtype)
 
 
 def _away(value: np.ndarray) -> np.ndarray:

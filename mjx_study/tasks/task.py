@@ -37,7 +37,7 @@ class Recipe:
     iterations: int
     samples: int
     decay: float = 0.0
-    optimizer: str = "sgd"
+    optimizer: str = dataclasses.field(default="sgd", metadata={"later": True})
 
 
 @dataclasses.dataclass(frozen=True)
