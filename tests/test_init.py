@@ -193,6 +193,17 @@ def test_contacts_are_those_of_a_fall() -> None:
     assert found.horizon * 0.004 >= max(2 * 0.143 - 0.01, 0.5)
 
 
+def test_a_wheel_on_its_axle_is_to_turn() -> None:
+    """Its centre of mass cannot reach a goal; the joint's angle can."""
+    found = proposed("""<mujoco><worldbody>
+      <body name="disk"><joint axis="0 1 0"/><geom type="cylinder" size=".06 .02" euler="90 0 0"/></body>
+      <body pos="0 0 .2"><joint name="arm" axis="0 1 0" range="-60 60"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.12" size=".01" contype="0" conaffinity="0"/>
+        <geom name="tip" size=".02" pos="0 0 -.125"/></body></worldbody>
+      <actuator><motor joint="arm" ctrlrange="-1 1" gear=".3"/></actuator></mujoco>""")
+    assert (found.aim.body, found.aim.axis) == (None, 0) and found.aim.distance > 0.01
+
+
 def test_a_learning_rate_lowers_the_cost() -> None:
     found = proposed(LEG)
     aim, drive, steps = found.aim, found.drive, found.horizon

@@ -22,10 +22,11 @@ from mjx_study import runtime
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.graph import build, c, cuda, native, random
 from mjx_study.graph.function import capture
-from mjx_study.graph.native import SWITCH, computes_steps, native_identity
+from mjx_study.graph.native import SWITCH, computes_steps, native_identity, native_summary
 from mjx_study.graph.nodes import ELEMENTWISE
 from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation.dynamics import initial_state, step
+from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
 from tests.test_graph import FUNCTIONS, ROW
 
@@ -137,6 +138,19 @@ def test_normal_random_numbers(size):
     drawn = ours(data)
     np.testing.assert_allclose(drawn, theirs(data), rtol=1e-13)
     np.testing.assert_array_equal(ours(data[17:20]), drawn[17:20])
+
+
+@pytest.mark.parametrize("shape", ["sphere", "cylinder"])
+def test_gradients_of_contact_with_a_cylinder_are_native(shape: str) -> None:
+    """MJX places its contacts by derivatives of a distance, so that gradients take second ones."""
+    ball = f'<body pos="0 0 .19"><freejoint/><geom type="{shape}" size=".1 .1"/></body>'
+    wheel = '<body euler="90 0 0"><joint axis="0 0 1"/><geom type="cylinder" size=".1 .1"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{wheel}{ball}</worldbody></mujoco>")
+    scene, before = put_scene(model, shape), native_summary().partition(",")[2]
+    start = initial_state(scene)
+    force = lambda state: jnp.sum(step(scene, scene.model, state, jnp.zeros(0))[0].qvel)  # noqa: E731
+    found = jax.jit(jax.vmap(jax.grad(force)))(jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), start))
+    assert native_summary().partition(",")[2] == before and np.abs(found.qpos).max() > 1
 
 
 def test_normal_random_numbers_of_the_tails():
@@ -279,6 +293,7 @@ import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation.dynamics import initial_state, step
+from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
 print(jax.make_jaxpr(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
 print(jax.jit(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))

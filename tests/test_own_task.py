@@ -26,7 +26,7 @@ from mjx_study.tasks.task import Task
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "extending.md").read_text()
-MJCF, PYTHON, LIFTED, OTHERS = (
+MJCF, PYTHON, LIFTED, OTHERS, *_ = (
     *re.findall(r"```xml\n(.*?)```", PAGE, re.DOTALL),
     *re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL),
 )

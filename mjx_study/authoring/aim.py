@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+import mujoco
 import numpy as np
 
 from mjx_study.authoring.trial import Drive, Trial, moments_of, start_of
@@ -18,6 +19,10 @@ TYPICAL: Final = 1.5
 """Standard deviation of normal numbers in median absolute deviations; a single fall or throw does not count."""
 LEAST: Final = 0.02
 """Least distance of a goal, in extents of the model."""
+SCALAR: Final = int(mujoco.mjtJoint.mjJNT_SLIDE)
+"""The first type of joint with one coordinate."""
+BEYOND: Final = 0.25
+"""Share of that distance over which held controls must move a body for it to have a goal."""
 REACHED: Final = 0.25
 """Share of the ends under held controls from which on a side counts as within reach; else the goal is on the other."""
 FORWARD: Final = 0.3
@@ -66,17 +71,35 @@ def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequenc
     for body, role in _candidates(drive):
         ends, far = (np.array([each.centres[steps, body] for each in trials]) for trials in (noisy, held))
         spread = TYPICAL * np.median(np.abs(far - np.median(far, axis=0)), axis=0)
-        if np.std(ends, axis=0).max() > MOVED:
+        hardly = np.ptp(far, axis=0).max() < BEYOND * LEAST * drive.host.stat.extent  # as of a wheel on its axle
+        if hardly and (aim := _coordinate(quiet, noisy, held, steps, _own_coordinates(drive.host, body))):
+            return aim
+        if not hardly and np.std(ends, axis=0).max() > MOVED:
             axis = 0 if spread[0] >= FORWARD * spread.max() else int(np.argmax(spread))
-            end = tuple(np.round(quiet.centres[steps, body], 9).tolist())  # without what rounding leaves of 0
+            end = tuple((np.round(quiet.centres[steps, body], 9) + 0.0).tolist())  # without what rounding leaves of 0
             distance = rounded(max(spread[axis], LEAST * drive.host.stat.extent), 1)
             return Aim(body, role, axis, end, distance, _side(far[:, axis], end[axis]))
+    return _coordinate(quiet, noisy, held, steps, range(drive.host.nq))
+
+
+def _coordinate(
+    quiet: Trial, noisy: Sequence[Trial], held: Sequence[Trial], steps: int, among: Sequence[int]
+) -> Aim | None:
+    """The coordinate among some that noise moves most; None if it moves none."""
+    if not among:
+        return None
     ends, far = (np.array([each.qpos[steps] for each in trials]) for trials in (noisy, held))
-    axis = int(np.argmax(np.std(ends, axis=0)))
+    axis = max(among, key=lambda each: float(np.std(ends[:, each])))
     if min(np.std(ends[:, axis]), np.std(far[:, axis])) <= MOVED:
         return None
-    end, distance = float(quiet.qpos[steps, axis]), rounded(float(np.std(far[:, axis])), 1)
+    end, distance = round(float(quiet.qpos[steps, axis]), 9) + 0.0, rounded(float(np.std(far[:, axis])), 1)
     return Aim(None, "coordinate", axis, (end,), distance, _side(far[:, axis], end))
+
+
+def _own_coordinates(host: mujoco.MjModel, body: int) -> list[int]:
+    """Indices in qpos of a body's hinges and slides."""
+    joints = range(host.body_jntadr[body], host.body_jntadr[body] + host.body_jntnum[body])
+    return [int(host.jnt_qposadr[each]) for each in joints if host.jnt_type[each] >= SCALAR]
 
 
 def _side(ends: np.ndarray, end: float) -> int:

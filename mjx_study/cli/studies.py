@@ -142,11 +142,11 @@ def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> 
             dataset = load_study(folder)
         unwritten = f"cannot write to {folder}: {error.strerror or error}; {INTACT}"
     computed = dataset.attrs.get("computed_cells", missing - dataset.attrs["missing_cells"])
-    sizes = ", ".join(f"{name} {length}" for name, length in dataset.sizes.items())
+    sizes = ", ".join(f"{name} {length}" for name, length in dataset.sizes.items() if length > 1)
     titles, rows = numbers_of(dataset) or ([], [])
     findings = findings_of(dataset)
     lines = [*format_table(rows, titles), ""] if 0 < len(rows) <= MOST_ROWS else []
-    lines += [*(f"{sentence}." for sentence in findings), f"computed {computed} cells; {sizes}"]
+    lines += [*(f"{sentence}." for sentence in findings), f"computed {computed} cells{sizes and f'; {sizes}'}"]
     lines += [f"warning: {message}" for message in warnings_of(dataset) if message not in plan.warnings]
     lines += [f"written to {folder}: results.nc; mjx-study plot {folder} draws it"] if unwritten is None else []
     document = {

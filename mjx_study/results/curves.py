@@ -58,7 +58,7 @@ def _gap(one: xr.Dataset, mean: str) -> str:
     seen = np.abs(first - slope) > error
     if not np.any(seen):
         lost = error >= np.nanmax(np.abs(first), initial=0.0)
-        blind = f"; at {percent(float(np.mean(lost)))} of the points, no slope as large as {mean}'s would be seen"
+        blind = f"; at {percent(float(np.mean(lost)))} of the points those exceed all of {mean}: take more --samples"
         return f"{mean} nowhere differs from {source} by {uncertainty}" + blind * bool(np.any(lost))
     name, unit = line_of(one)
     unit = f" {unit}" if unit else ""

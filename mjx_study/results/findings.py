@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -172,7 +173,8 @@ def _bias_findings(rows: Sequence[Row], gammas: Bounds, label: Callable[[str], s
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
         mean = f"{label(estimator)}'s mean is"
         if biased:
-            shares = ", ".join(f"{_share(same)}{_of(same, seeds)}" for same in _by(biased, "stiffness").values())
+            alike = grouped(_by(biased, "stiffness").values(), partial(_share_of, seeds=seeds))
+            shares = ", ".join(f"{share}{_at(chain(*same))}{often}" for (share, often), same in alike.items())
             least = max(row.bias_p_value for row in biased)
             free = math.isinf(gammas.get((biased[0].task, estimator), 0.0))
             advice = ": it has no accuracy bound; set one with --gamma" if free else ""
@@ -220,7 +222,15 @@ def _off(row: Row) -> bool:
 
 def _of(rows: Sequence[Row], seeds: int) -> str:
     """Where rows are, and how many of the seeds they are."""
-    return _at(rows) + (f" in {len(rows)} of {seeds} seeds" if seeds > 1 else "")
+    return _at(rows) + _often(rows, seeds)
+
+
+def _share_of(rows: Sequence[Row], seeds: int) -> tuple[str, str]:
+    return _share(rows), _often(rows, seeds)
+
+
+def _often(rows: Sequence[Row], seeds: int) -> str:
+    return f" in {len(rows)} of {seeds} seeds" if seeds > 1 else ""
 
 
 def _share(rows: Sequence[Row]) -> str:
@@ -234,7 +244,7 @@ def _share(rows: Sequence[Row]) -> str:
     return percent(share, 1) if error < 0.005 else f"{float(f'{100 * share:.2g}'):g} %"
 
 
-def _at(rows: Sequence[Row]) -> str:
+def _at(rows: Iterable[Row]) -> str:
     """Format the stiffnesses of rows for a sentence; empty without contact."""
     stiffnesses = list(dict.fromkeys(row.stiffness for row in rows))
     digits = digits_to_tell_apart(stiffnesses, least=4)

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import rotate_quaternion, rotation_between
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED, cholesky, solve_factored, solve_positive_definite
@@ -143,34 +142,18 @@ def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]
 def cylinder_distance(position: Float[Array, " 3"], size: Float[Array, " 3"]) -> Float[Array, ""]:
     """MJX's signed distance [m] of a point from a cylinder along z, with size (radius, half length, 0) [m].
 
-    MJX places contacts by its gradient. For an inside point, the square root in the branch for outside points is at 0,
-    so the gradient has no derivative in reverse mode.
+    MJX places contacts by its gradient. For an inside point, the square root in its branch for outside points is at 0,
+    so that gradient has no derivative in reverse mode.
     """
-    return _cylinder(position, size)
-
-
-def _cylinder_rule(primals: Any, changes: Any) -> Any:
-    (position, size), (moved, grown) = primals, instantiated(primals, changes)
-    radius, height = _root(position[0] ** 2 + position[1] ** 2), jnp.abs(position[2])
-    gaps = jnp.stack([radius - size[0], height - size[1]])
-    outside = jnp.maximum(gaps, 0)
-    across, along = position[:2] / _positive(radius), position[2] / _positive(height)
-    change = jnp.stack([jnp.dot(across, moved[:2]), along * moved[2]]) - grown[:2]
-    inward, outward = jnp.arange(2) == jnp.argmax(gaps), outside / _positive(_root(jnp.sum(outside**2)))
-    return _cylinder(*primals), jnp.dot(jnp.where(gaps.max() < 0, inward, outward), change)
-
-
-_cylinder = with_rule(lambda *arguments: _ORIGINAL["collision_sdf", "_cylinder"](*arguments), _cylinder_rule)
+    height = position[2] * jnp.sign(position[2])  # its derivative at 0 is 0, as in MJX
+    gaps = jnp.stack([_root(position[0] ** 2 + position[1] ** 2) - size[0], height - size[1]])
+    inside = jnp.where(gaps[0] >= gaps[1], gaps[0], gaps[1])
+    return jnp.where(inside < 0, inside, _root(jnp.sum(jnp.maximum(gaps, 0) ** 2)))
 
 
 def _root(square: Float[Array, ""]) -> Float[Array, ""]:
     """Square root, with derivative 0 at 0."""
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-
-
-def _positive(length: Float[Array, ""]) -> Float[Array, ""]:
-    """Nonzero length to divide by, as in MJX."""
-    return length + 1e-12 * (length <= 1e-8)
 
 
 def factored_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
