@@ -44,14 +44,8 @@ def source_of_task(mjcf: Path, found: Proposal) -> str:
     unit = "" if body is None else f" m along {'xyz'[aim.axis]}"
     by_time = sorted(found.touches.items(), key=lambda item: item[1].first)
     return pages.from_string(Path(__file__).with_suffix(".jinja").read_text()).render(
-        {
-            "HELD": HELD,
-            "ITERATIONS": ITERATIONS,
-            "MOST_LISTED": MOST_LISTED,
-            "PACE": PACE,
-            "SAMPLES": SAMPLES,
-            "TRIALS": TRIALS,
-        },
+        {"HELD": HELD, "ITERATIONS": ITERATIONS, "MOST_LISTED": MOST_LISTED, "SAMPLES": SAMPLES, "TRIALS": TRIALS},
+        PACE=PACE,
         WEIGHT=WEIGHT,
         mjcf=mjcf,
         found=found,

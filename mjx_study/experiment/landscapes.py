@@ -30,7 +30,7 @@ from mjx_study.experiment.resolution import line_of
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, unconverged
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
 from mjx_study.options.option import OptionError
-from mjx_study.results.curves import landscape_findings
+from mjx_study.results.curves import landscape_findings, least_of
 from mjx_study.results.kind import Drawing
 from mjx_study.results.variables import LANDSCAPES
 from mjx_study.runtime import precision
@@ -77,7 +77,7 @@ class Landscapes(StudyKind):
 
     def summarised(self, dataset: xr.Dataset) -> xr.Dataset:
         """Add the extremes of each curve."""
-        least = dataset["smoothed"].fillna(np.inf).argmin("point")
+        least = least_of(dataset)
         return dataset.assign(
             least_cost=dataset["smoothed"].min("point"),
             least_cost_se=dataset["smoothed_se"].isel(point=least),

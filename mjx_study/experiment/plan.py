@@ -30,7 +30,7 @@ from mjx_study.tasks.network import with_network
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task, check_shapes
 
-IN_NUMPY: Final = 10_000_000
+LONG_IN_NUMPY: Final = 10_000_000
 """Steps, a minute or so, from which a study says that NumPy computes them."""
 
 
@@ -92,8 +92,8 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
         size = chunk_for(most, local_devices(), tasks, own_program=kind.one_program)
     plan = StudyPlan(config, tuple(groups), tuple(cells), size, tuple(dict.fromkeys(messages)))
     kind.check_memory(plan)
-    steps = sum(int(kind.rollouts(plan, cell)[0]) * plan.task_of(cell).horizon for cell in cells)
-    if steps > IN_NUMPY and in_numpy():
+    steps = in_numpy() and sum(int(kind.rollouts(plan, cell)[0]) * plan.task_of(cell).horizon for cell in cells)
+    if steps > LONG_IN_NUMPY:
         message = f"NumPy computes {count(steps)} steps: with a C compiler they take a tenth of the time"
         plan = dataclasses.replace(plan, warnings=(*plan.warnings, f"{message} (docs/native.md)"))
     for cell in {cell.group: cell for cell in cells}.values():

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from mjx_study.graph.function import Passes, ScalarFunction, depending_on
-from mjx_study.graph.nodes import Node, depth_first, entries_of, no_type_check
+from mjx_study.graph.nodes import ELEMENTWISE, Node, depth_first, entries_of, no_type_check
 from mjx_study.graph.parts import Loop, Statement, in_parts
 
 COMPARISONS: Final = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
@@ -329,7 +329,7 @@ class Writer:
                 return f"{first} {'<<' if name == 'shift_left' else '>>'} {others[0]}"
             case "bitcast_convert_type" if "mask" not in (kind, _type(of)):
                 return f"BITS({kind}, {first})"
-            case "shift_left" | "shift_right_logical" | "bitcast_convert_type":
+            case "shift_left" | "shift_right_logical":
                 raise NotWrittenError(name)
             case "integer_pow":
                 return self._power(first, parameters["y"], node)
@@ -345,6 +345,8 @@ class Writer:
                 return self._selection(node.arguments[0], values, _select(node.dtype))
             case "convert_element_type":
                 return _converted(first, np.dtype(of), node.dtype)
+        if name not in ELEMENTWISE:
+            raise NotWrittenError(name)
         return _FORMS[name].format(*values, kind=kind) if name in _FORMS else f"{name}_{kind}({', '.join(values)})"
 
     def _power(self, base: str, exponent: int, node: Node) -> str:

@@ -34,14 +34,15 @@ def landscape_findings(dataset: xr.Dataset) -> list[str]:
     both, name = {"zobg", "fobg"} <= set(dataset["estimator"].values), label_of("fobg", onset_of(dataset))
     curves = curves_of(dataset)
     found = [f"{label}: {_gap(one, f'E[{name}]')}" for label, one in curves] if both else []
-    ends = [label for label, one in curves if _least(one) in (0, one.sizes["point"] - 1)]
+    ends = [label for label, one in curves if int(least_of(one)) in (0, one.sizes["point"] - 1)]
     if ends:
         found.append(f"{', '.join(ends)}: the mean cost is least at an end of the line; --span makes it longer")
     return found
 
 
-def _least(one: xr.Dataset) -> int:
-    return int(one["smoothed"].fillna(np.inf).argmin("point"))
+def least_of(dataset: xr.Dataset) -> xr.DataArray:
+    """Index of the point with the lowest mean cost, of every curve."""
+    return dataset["smoothed"].fillna(np.inf).argmin("point")
 
 
 def _gap(one: xr.Dataset, mean: str) -> str:
