@@ -175,8 +175,9 @@ def test_findings_report_its_bias(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--samples", "400", "--reference-samples", "400", "--estimators", f"{DOUBLED},{CAUTIOUS}"]
     found = document(capsys, "compare", *ANALYTIC, *arguments)["findings"]
     (told,) = (sentence for sentence in found if "mean is" in sentence)
-    percent = r"[\d.]+ %"
-    assert re.match(rf"reference: Doubled's mean is biased by {percent} at K = 10 N/m, {percent} at K = 100 N/m", told)
+    assert told.startswith("reference: Doubled's mean is biased by") and re.search(r"\b10\b.*\b100 N/m", told)
+    for share, error in re.findall(r"([\d.]+) ± ([\d.]+) %", told):
+        assert abs(float(share) - 100) < 3 * float(error) < 60
 
 
 def test_gradcheck_takes_it(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from estimators import ESTIMATORS, ORACLES
 from mjx_study.results.rows import BIASED_P_VALUE, SETTING, Row, label_in, rows_of
-from mjx_study.table import digits_to_tell_apart, grouped, percent
+from mjx_study.table import digits_to_tell_apart, grouped, percent, with_error
 
 OFF_SE: Final = 4.0
 """Standard errors beyond which a mean without a verdict is reported as off."""
@@ -234,14 +234,14 @@ def _often(rows: Sequence[Row], seeds: int) -> str:
 
 
 def _share(rows: Sequence[Row]) -> str:
-    """Median debiased error as a share of the reference gradient, to significant digits only, if that is known."""
+    """Median debiased error as a share of the reference gradient with one standard error, if that is known."""
     if any(row.reference_uncertainty > MOST_UNCERTAINTY for row in rows):
         return "an unknown share"
     share = float(np.median([row.debiased_error for row in rows]))
     error = max(max(row.debiased_error_se, row.reference_uncertainty) for row in rows)
     if not math.isfinite(share):
         return "more than can be computed"
-    return percent(share, 1) if error < 0.005 else f"{float(f'{100 * share:.2g}'):g} %"
+    return f"{with_error(100 * share, 100 * error)} %"
 
 
 def _at(rows: Iterable[Row]) -> str:
