@@ -30,7 +30,8 @@ from matplotlib.ticker import NullLocator
 from scipy import stats
 
 import mjx_study
-from estimators import Differentiation, Estimator, Evaluation, make_estimator, noise
+from estimators import Differentiation, Estimator, Evaluation, GradientEstimate, make_estimator, noise
+from estimators.interpolation import apply_choice, constrained_alpha
 from estimators.sampling import draw
 from experiments import DOCS
 from experiments.figures.rollouts import INK
@@ -47,6 +48,7 @@ METHODS: Final[dict[str, Estimator]] = {
     "fobg": make_estimator("fobg"),
     "fobg_onset": make_estimator("fobg_onset"),
     "ivw": make_estimator("ivw", baseline="leave_one_out"),
+    "aobg": make_estimator("aobg", baseline="leave_one_out"),
     "ivw_onset": make_estimator("aobg_onset", baseline="leave_one_out"),
     "fobg_law": make_estimator("fobg"),
 }
@@ -65,6 +67,8 @@ PIECES: Final = {"walk": 8, "hopper": 4}
 """Pieces of a rollout."""
 WINDOWS: Final[dict[str, tuple[int, ...]]] = {"walk": (2, 4, 8), "hopper": (4,)}
 """Pieces between cuts of the adjoint."""
+GAMMAS: Final[dict[str, tuple[float, ...]]] = {"walk": (100.0, 200.0, 400.0), "hopper": (40.0, 80.0, 160.0)}
+"""AoBG's bounds: about half, once and twice the radius of the zeroth-order mean at the start."""
 TITLES: Final = {"walk": "quadruped", "hopper": "hopper"}
 SEEDS: Final = 3
 """Descents of each pair of the grid."""
@@ -160,13 +164,17 @@ def law_contact(task: Task) -> ContactModel:
 
 
 def iteration(task: Task, method: str):
-    """One iteration of all descents, as a function of (theta, optimiser's state, learning rate, window, key)."""
+    """One iteration of all descents, as a function of (theta, optimiser's state, learning rate, second setting, key).
+
+    The second setting is AoBG's bound or, for other methods, the window.
+    """
     estimator, contact = METHODS[method], law_contact(task) if method == "fobg_law" else None
     rollouts = 1 if len(estimator.needs) == 1 and estimator.needs[0] != "pair" else 2
 
-    def one(theta, state, rate, window, key):
+    def one(theta, state, rate, second, key):
+        window = PIECES[task.name] if method == "aobg" else second
         batches = draw(estimator.needs, Pieces(task, window, contact), theta, key, SAMPLES // rollouts)
-        estimate = estimator(batches)
+        estimate = bounded(batches, second) if method == "aobg" else estimator(batches)
         usable = jnp.all(jnp.isfinite(estimate.mean))
         updates, following = OPTIMIZER.update(jnp.where(usable, estimate.mean, 0.0), state, theta)
         first = jax.tree.leaves(batches[estimator.needs[0]])[0]
@@ -176,21 +184,31 @@ def iteration(task: Task, method: str):
     return jax.jit(jax.vmap(one))
 
 
-def descend(task: Task, method: str, settings: list[tuple[float, int, int]], iterations: int = ITERATIONS):
-    """Run descents with (learning rate, window, seed) each, together; return thetas, and curves with their seconds."""
+def bounded(batches: Any, gamma: Any) -> GradientEstimate:
+    """AoBG with a bound that is a value of the program, so that one program serves the grid."""
+    estimator: Any = METHODS["aobg"]
+    parts = estimator.parts(*estimator.pick(batches))
+    choice = estimator.choose(*parts)
+    variances = choice.variance_zeroth, choice.variance_first
+    alpha = constrained_alpha(*variances, choice.discrepancy, choice.epsilon, gamma)
+    return apply_choice(dataclasses.replace(choice, alpha=alpha), *parts)
+
+
+def descend(task: Task, method: str, settings: list[tuple[float, float, int]], iterations: int = ITERATIONS):
+    """Run descents with (learning rate, second setting, seed) each, together; return thetas, and curves."""
     count = len(settings)
-    rates, windows, seeds = (jnp.array(column) for column in zip(*settings, strict=True))
+    rates, settled, seeds = (jnp.array(column) for column in zip(*settings, strict=True))
     keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(7), seed))(seeds)
     theta = jnp.broadcast_to(task.theta, (count, task.theta.size))
     state = jax.vmap(OPTIMIZER.init)(theta)
     step = iteration(task, method)
     fold = jax.jit(jax.vmap(jax.random.fold_in, (0, None)))
     began = time.perf_counter()
-    jax.block_until_ready(step(theta, state, rates, windows, fold(keys, 0)))
+    jax.block_until_ready(step(theta, state, rates, settled, fold(keys, 0)))
     built, records, seconds = time.perf_counter() - began, [], []
     began = time.perf_counter()
     for index in range(iterations):
-        theta, state, record = step(theta, state, rates, windows, fold(keys, index))
+        theta, state, record = step(theta, state, rates, settled, fold(keys, index))
         records.append(jax.device_get(record))
         seconds.append(time.perf_counter() - began)
     costs, alphas, usable, nonfinite = (np.array(column).T for column in zip(*records, strict=True))
@@ -248,8 +266,10 @@ def executed(task: Task, thetas: Float[np.ndarray, "policies params"]) -> dict[s
     return found
 
 
-def grid(name: str, method: str) -> list[tuple[float, int]]:
-    """Learning rates and windows to choose from, nine pairs for every method."""
+def grid(name: str, method: str) -> list[tuple[float, float]]:
+    """Learning rates and windows, or bounds of AoBG, to choose from, nine pairs for every method."""
+    if method == "aobg":
+        return list(product(RATES if name == "walk" else (1.5e-3, 2.6e-3, 4.5e-3), GAMMAS[name]))
     if method == "zobg" or len(WINDOWS[name]) == 1:
         return [(float(rate), PIECES[name]) for rate in np.geomspace(RATES[0] / 4, 4 * RATES[-1], 9)]
     return list(product(RATES, WINDOWS[name]))
@@ -265,8 +285,8 @@ def tune(name: str, method: str, iterations: int = ITERATIONS) -> dict[str, Any]
     return {"pairs": pairs, "final": final, **kept}
 
 
-def learn(name: str, method: str, rate: float, window: int) -> dict[str, Any]:
-    """Descents of new seeds with a learning rate and a window."""
+def learn(name: str, method: str, rate: float, window: float) -> dict[str, Any]:
+    """Descents of new seeds with a learning rate and a window, or AoBG's bound."""
     task = make(name)
     settings = [(rate, window, 100 + seed) for seed in range(LEARN_SEEDS)]
     thetas, found = descend(task, method, settings)
@@ -346,8 +366,9 @@ def table(lines: list[dict[str, Any]], name: str) -> str:
     for method in [*METHODS, "ppo"]:
         if seeds := _new_seeds(lines, name, method):
             numbers = [np.concatenate([np.ravel(each[column]) for each in seeds]) for column in columns]
-            window = f", {each:g}/{PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
-            chosen = f"{seeds[0]['rate']:.2g}{window}"
+            window = seeds[0].get("window")
+            second = _second(name, method).format(window) if window and method != "zobg" else ""
+            chosen = f"{seeds[0]['rate']:.2g}{second}"
             rows.append((f"`{method}`" if method != "ppo" else "PPO", chosen, *map(_with_interval, numbers)))
     return markdown_table(rows, HEADINGS)
 
@@ -358,13 +379,18 @@ def grid_table(lines: list[dict[str, Any]], name: str) -> str:
     for line in lines:
         if (line["what"], line["task"]) == ("tune", name):
             windows = {window for _, window in line["pairs"]}
-            share = f", {{:g}}/{PIECES[name]}" if len(windows) > 1 else ""
+            second = _second(name, line["method"]) if len(windows) > 1 else ""
             cells = [
-                f"{number(float(np.mean(final)))} ({rate:.2g}{share.format(window)})"
+                f"{number(float(np.mean(final)))} ({rate:.2g}{second.format(window)})"
                 for (rate, window), final in zip(line["pairs"], line["final"], strict=True)
             ]
             rows.append((f"`{line['method']}`", *cells))
     return markdown_table(sorted(rows), ["method", *map(str, range(1, 10))])
+
+
+def _second(name: str, method: str) -> str:
+    """Format of a window as a share of the rollout, or of AoBG's bound."""
+    return ", gamma {:g}" if method == "aobg" else f", {{:g}}/{PIECES[name]}"
 
 
 def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:

@@ -3,10 +3,12 @@
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mjx_study
+from estimators import Differentiation, Evaluation, make_estimator
 from experiments import DATA, DOCS, learning
 from experiments.quadruped import walk
 from mjx_study.objective import Simulator
@@ -26,6 +28,23 @@ def test_windows_cut_the_adjoint_and_nothing_else(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_allclose(uncut.gradient, whole.gradient, rtol=1e-7, atol=1e-9)
     np.testing.assert_array_equal(cut.value, uncut.value)
     assert np.max(np.abs(cut.gradient - uncut.gradient)) > 0.01 * np.max(np.abs(uncut.gradient))
+
+
+def test_a_bound_that_is_a_value_is_that_of_the_estimator() -> None:
+    """Batches whose weight no bound, a bound, and a bound below the radius decide."""
+    values, scores, gradients = (jnp.array(np.random.default_rng(0).normal(size=(each, 50))) for each in (1, 3, 3))
+    zeroth = Evaluation(values[0], scores.T, jnp.zeros(50), jnp.zeros(50))
+    first = Differentiation(values[0], 1 + gradients.T, jnp.zeros(50))
+    batches = {"evaluation": zeroth, "differentiation": first}
+    free = make_estimator("aobg", baseline="leave_one_out")(batches)
+    assert free.alpha and free.alpha.epsilon is not None and free.alpha.discrepancy is not None
+    weights = [0.0]
+    for gamma in (0.9 * free.alpha.epsilon, free.alpha.epsilon + 0.3 * free.alpha.discrepancy, np.inf):
+        found = jax.jit(learning.bounded)(batches, gamma)
+        expected = make_estimator("aobg", baseline="leave_one_out", gamma=float(gamma))(batches)
+        np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12)
+        weights.append(float(found.alpha.alpha))
+    assert weights[1] == 0 < weights[2] < weights[3]
 
 
 def test_the_page_has_the_tables_of_the_data() -> None:
