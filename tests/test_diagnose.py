@@ -115,6 +115,26 @@ def test_steps_are_checked_without_noise(found: Diagnosis) -> None:
     assert all("--sigma" in command for command in commands if command != steps)
 
 
+def test_other_parameters_and_what_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Thrown upwards, the ball is in the air until the end, where half the squared displacement has a slope of t x."""
+    name, speed, steps, folder = ball(tmp_path), 1.2, 65, tmp_path / "out"
+    command = ["diagnose", name, "--horizon", str(steps), "--sigma", "0.01", "--samples", "100"]
+    assert cli.main([*command, "--theta", str(speed), "--output", str(folder), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    time = steps * TIMESTEP
+    rise = speed * time - GRAVITY * TIMESTEP**2 * steps * (steps + 1) / 2
+    assert document["theta"] == str(speed) and document["onsets"] == 0
+    assert document["gradient_norm"] == pytest.approx(time * rise, rel=0.01)
+    assert json.loads((folder / "diagnosis.json").read_text()) == document
+    page = (folder / "diagnosis.txt").read_text().splitlines()
+    assert page[2].endswith(f"65 steps of 0.002 s, at theta {speed:g}")
+    printed = [line.removeprefix("  > mjx-study ").split() for line in page if line.startswith("  > ")]
+    steps_only = [each for each in printed if each[0] == "gradcheck" and "--mean" not in each]
+    assert len(steps_only) == 1 and "--theta" not in steps_only[0]
+    assert len(printed) > 2 and all("--theta" in each for each in printed if each not in steps_only)
+    assert cli.main(["gradcheck", name, "--theta", "1"]) == 2 and cli.main([*command, "--theta", "1,2"]) == 2
+
+
 @pytest.mark.slow
 def test_the_advised_impedance_avoids_the_bias(found: Diagnosis, tmp_path: Path) -> None:
     (text,) = (text for text in advised(found) if "solimp" in text)

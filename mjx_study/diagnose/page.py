@@ -7,6 +7,7 @@ import shlex
 import textwrap
 from typing import Any, Final
 
+from mjx_study.choices import is_file
 from mjx_study.diagnose.advice import advise, cautions
 from mjx_study.diagnose.columns import CONTACTS, DISTANCE, ESTIMATES, TOUCHES
 from mjx_study.diagnose.means import ALONG_MEANS
@@ -32,6 +33,7 @@ def document_of(found: Diagnosis) -> dict[str, Any]:
     norm = found.norm if found.resolved else math.nan
     document = {
         "subject": found.subject,
+        "theta": found.theta or None,
         "cost": found.task.description,
         "contact": found.contact,
         "samples": found.samples,
@@ -72,7 +74,7 @@ def page_lines(found: Diagnosis) -> list[str]:
     lines = [
         f"{found.subject}: {found.task.description or found.task.name}",
         f"contact {found.contact}, {found.samples} samples",
-        found.setting.line(),
+        f"{found.setting.line()}{found.theta and f', at theta {found.theta}'}",
         *([] if found.resolved else [_unresolved(found)]),
         *(f"warning: {text}" for text in (*found.warnings, *cautions(found))),
         "",
@@ -81,7 +83,8 @@ def page_lines(found: Diagnosis) -> list[str]:
     ]
     if found.onsets.get("onsets") and not found.law:
         lines.append(f"{compare} --estimators fobg_onset --samples {found.samples} --json")
-    steps = re.sub(r" --sigma \S+", "", check)  # steps have no noise
+    steps = re.sub(r" --sigma \S+", "", check)  # steps have no noise, and those of a file no policy
+    steps = re.sub(r" --theta ('[^']*'|\S+)", "", steps) if is_file(found.subject) else steps
     lines += ["", "derivatives of a step", f"  {_derivatives(found)}", steps]
     if found.resolved:
         norm = with_error(found.surest.norm, found.norm_error)

@@ -30,7 +30,7 @@ class Diagnosis(Measurement):
     """Everything measured; `page` formats it.
 
     Attributes:
-        subject: the model as named by the user.
+        subject, theta: the model, and parameters other than the task's, as named by the user.
         contact, warnings: label of the contact model, and warnings about it.
         law, lead: name of its law, None if MuJoCo's, and the time before touch from which it acts [s].
         touches: contacts that begin in the zero-noise rollout.
@@ -38,6 +38,7 @@ class Diagnosis(Measurement):
     """
 
     subject: str
+    theta: str
     task: Task
     setting: RolloutSetting
     contact: str
@@ -108,6 +109,7 @@ def diagnose_task(
     smoothing: float | None = None,
     samples: int | None = None,
     seed: int = 0,
+    theta: str = "",
     options: str = "",
     progress: Progress = silent,
 ) -> Diagnosis:
@@ -118,6 +120,7 @@ def diagnose_task(
         family, stiffness, damping, smoothing: of the contact [N/m, N s/m, J]; None for those of a single run.
         samples: samples per batch, and per node of the paths along which means are checked; None for `SAMPLES`, or
             fewer or more as in `measure`.
+        theta: name of the task's theta if it is not its own.
         options: contact options as command-line flags.
 
     Raises:
@@ -148,6 +151,7 @@ def diagnose_task(
     return Diagnosis(
         **vars(found),
         subject=subject,
+        theta=theta,
         task=task,
         setting=setting_of(subject, task),
         contact=cell.label,
