@@ -1,6 +1,7 @@
 """Check that an estimator's mean is the gradient of F using values of F alone, without a reference gradient."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -61,10 +62,27 @@ class Circulation:
         Few effective samples leave it undecided, unless every sample's gap is within that share.
         """
         gap, half, within = abs(float(self.gap)), float(self.half_width), tolerance * abs(float(self.difference))
-        few = gap > 0 and not float(self.effective) >= ENOUGH_EFFECTIVE
-        if float(self.quadrature) > within or (few and float(self.largest) > within):
+        if float(self.quadrature) > within or (self._few and float(self.largest) > within):
             return "undecided"
-        return "right" if gap + half <= within else "biased" if gap > half and not few else "undecided"
+        return "right" if gap + half <= within else "biased" if gap > half and not self._few else "undecided"
+
+    @property
+    def _few(self) -> bool:
+        return float(self.gap) != 0 and not float(self.effective) >= ENOUGH_EFFECTIVE
+
+    def more_samples(self, tolerance: float = TOLERANCE) -> float:
+        """Factor by which the number of samples would have to grow for a verdict, if gap and quadrature error stay.
+
+        1 with a verdict; infinite if the quadrature error alone prevents one.
+        """
+        if self.verdict(tolerance) != "undecided":
+            return 1.0
+        gap, quadrature, within = abs(float(self.gap)), float(self.quadrature), tolerance * abs(float(self.difference))
+        room = max(within - gap, gap) - quadrature
+        if quadrature > within or not room > 0:
+            return math.inf
+        rare = ENOUGH_EFFECTIVE / float(self.effective) if self._few and float(self.effective) > 0 else 1.0
+        return max(rare, (HALF_WIDTH_SE * float(self.standard_error) / room) ** 2)
 
 
 def circulation(
@@ -91,6 +109,7 @@ def circulations(
     num_samples: int,
     *,
     nodes: int = NODES,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> list[Circulation]:
     """Integrate the means of estimators, which share their batches, along a straight path of theta.
 
@@ -105,6 +124,7 @@ def circulations(
         key: Random key; consumed.
         num_samples: Samples at every node, >= 2; fewer are a ValueError.
         nodes: Number of nodes, odd; an even one is a ValueError.
+        progress: Called with the number of nodes done, before each.
     """
     if nodes < 1 or nodes % 2 == 0:
         raise ValueError(f"nodes must be an odd number; got {nodes}")
@@ -113,7 +133,8 @@ def circulations(
     points, weights, coarse = path_rule(nodes)
     step, needs = end - start, oracles_of(estimators)
 
-    def along(theta):
+    def along(index, theta):
+        progress(index)
         batches = draw(needs, objective, theta, jax.random.clone(key), num_samples)
         return jnp.stack([estimator(batches).per_sample @ step for estimator in estimators])
 
@@ -122,7 +143,7 @@ def circulations(
         first, last = (objective.evaluate(theta, jax.random.clone(keys)).value for theta in (start, end))
         return last - first
 
-    slopes = jnp.stack([along(start + t * step) for t in points], axis=1)
+    slopes = jnp.stack([along(index, start + t * step) for index, t in enumerate(points)], axis=1)
     orders = [max(ORACLES[oracle].order for oracle in estimator.needs) for estimator in estimators]
     differences = {order: difference(order) for order in set(orders)}
     weights, rough = jnp.asarray(weights, slopes.dtype), jnp.asarray(weights - coarse, slopes.dtype)

@@ -2,6 +2,7 @@
 
     python -m experiments.learning tune walk zobg >> learning.jsonl                   # the grid, 3 seeds of each pair
     python -m experiments.learning learn walk zobg learning.jsonl >> learning.jsonl   # its best pair, 12 new seeds
+    python -m experiments.learning spread hopper fobg_law                             # its samples at the start
     python -m experiments.learning ppo walk ppo 1e-3 0 >> learning.jsonl              # pip install stable-baselines3
     python -m experiments.learning report learning.jsonl                              # its tables and figure
 
@@ -69,6 +70,7 @@ WINDOWS: Final[dict[str, tuple[int, ...]]] = {"walk": (2, 4, 8), "hopper": (4,)}
 """Pieces between cuts of the adjoint."""
 GAMMAS: Final[dict[str, tuple[float, ...]]] = {"walk": (100.0, 200.0, 400.0), "hopper": (40.0, 80.0, 160.0)}
 """AoBG's bounds: about half, once and twice the radius of the zeroth-order mean at the start."""
+FOOT: Final = {"walk": "front_left_foot", "hopper": "foot"}
 TITLES: Final = {"walk": "quadruped", "hopper": "hopper"}
 SEEDS: Final = 3
 """Descents of each pair of the grid."""
@@ -159,8 +161,12 @@ OPTIMIZER: Final = optax.chain(optax.clip_by_global_norm(MOST_NORM), optax.scale
 
 def law_contact(task: Task) -> ContactModel:
     """The contact of `LAW` as stiff as MuJoCo's default, solref = (0.02, 1) and dmax = 0.95, is under a foot."""
-    mass = effective_mass(task.scene, "floor", "foot")
+    mass = effective_mass(task.scene, "floor", FOOT[task.name])
     return family_model(LAW, task.scene, stiffness=mass / (0.95 * 0.02) ** 2, effective_mass=mass)
+
+
+def _contact(task: Task, method: str) -> ContactModel | None:
+    return law_contact(task) if method == "fobg_law" else None
 
 
 def iteration(task: Task, method: str):
@@ -168,7 +174,7 @@ def iteration(task: Task, method: str):
 
     The second setting is AoBG's bound or, for other methods, the window.
     """
-    estimator, contact = METHODS[method], law_contact(task) if method == "fobg_law" else None
+    estimator, contact = METHODS[method], _contact(task, method)
     rollouts = 1 if len(estimator.needs) == 1 and estimator.needs[0] != "pair" else 2
 
     def one(theta, state, rate, second, key):
@@ -294,6 +300,21 @@ def learn(name: str, method: str, rate: float, window: float) -> dict[str, Any]:
     return {"rate": rate, "window": window, "final": final_costs(task, thetas), **kept, **executed(task, thetas)}
 
 
+def spread(name: str, method: str) -> dict[str, Any]:
+    """First-order samples at the start: quantiles of their norms, and the cosines of the means of batches with the mean
+    of all but the largest hundredth."""
+    task, batches = make(name), 16
+    objective = Pieces(task, PIECES[task.name], _contact(task, method))
+    program = jax.jit(lambda keys: objective.differentiate(task.theta, keys).gradient)
+    keys = jax.random.split(jax.random.key(0), (batches, SAMPLES))
+    samples = np.stack([program(each) for each in keys])
+    norms = np.linalg.norm(samples, axis=-1)
+    usual = samples[norms < np.quantile(norms, 0.99)].mean(axis=0)
+    means = samples.mean(axis=1)
+    cosines = means @ usual / (np.linalg.norm(means, axis=1) * np.linalg.norm(usual))
+    return {"quantiles": np.quantile(norms, (0.5, 0.99, 1)), "cosines": cosines}
+
+
 def proximal(name: str, rate: float, seed: int) -> dict[str, Any]:
     """Proximal policy optimisation with as many steps."""
     from experiments.ppo import train
@@ -355,7 +376,8 @@ def figure(lines: list[dict[str, Any]]) -> Figure:
 
 def _new_seeds(lines: list[dict[str, Any]], name: str, method: str) -> list[dict[str, Any]]:
     """The lines of seeds that no learning rate was chosen by."""
-    found = [each for each in lines if (each["task"], each["method"]) == (name, method) and each["what"] != "tune"]
+    found = [each for each in lines if (each["task"], each["method"]) == (name, method) and "final" in each]
+    found = [each for each in found if each["what"] != "tune"]
     return [each for each in found if each.get("seed", 100) >= 100]
 
 
@@ -413,7 +435,7 @@ def main(what: str, name: str, method: str, *arguments: str) -> None:
         lines = [json.loads(line) for line in Path(arguments[0]).read_text().splitlines()]
         found = learn(name, method, *best(lines, name, method))
     else:
-        found = {"tune": tune, "ppo": lambda name, method, *rest: proximal(name, *rest)}[what](
+        found = {"tune": tune, "spread": spread, "ppo": lambda name, method, *rest: proximal(name, *rest)}[what](
             name, method, *map(json.loads, arguments)
         )
     line = {"what": what, "task": name, "method": method, **found}

@@ -14,6 +14,8 @@ MOST_LAYERS: Final = 100
 """Maximum number of hidden layers."""
 MOST_STEPS: Final = 1_000_000
 """Maximum number of rollout steps."""
+LARGEST_COORDINATE: Final = 1e10
+"""Size of coordinates and velocities from which a state counts as nonfinite [m, rad, m/s or rad/s], as in MuJoCo."""
 MOST_GIB: Final = 16.0
 """Maximum memory for arrays held at once [GiB], as counted by `mjx_study.experiment.memory.check_memory`."""
 

@@ -12,11 +12,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
+from estimators import Circulation, Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
-from mjx_study.diagnose.advice import advise
+from mjx_study.diagnose.advice import advise, cautions
 from mjx_study.diagnose.means import along_means
-from mjx_study.diagnose.measurement import ESTIMATORS, Measured, affordable, chunk_of
+from mjx_study.diagnose.measurement import ESTIMATORS, Measured, Measurement, affordable, chunk_of, more_samples
 from mjx_study.diagnose.page import document_of, page_lines
 from mjx_study.diagnose.run import Diagnosis, diagnose_task
 from mjx_study.diagnose.setting import setting_of
@@ -115,6 +115,26 @@ def test_steps_are_checked_without_noise(found: Diagnosis) -> None:
     assert all("--sigma" in command for command in commands if command != steps)
 
 
+def test_other_parameters_and_what_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Thrown upwards, the ball is in the air until the end, where half the squared displacement has a slope of t x."""
+    name, speed, steps, folder = ball(tmp_path), 1.2, 65, tmp_path / "out"
+    command = ["diagnose", name, "--horizon", str(steps), "--sigma", "0.01", "--samples", "100"]
+    assert cli.main([*command, "--theta", str(speed), "--output", str(folder), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    time = steps * TIMESTEP
+    rise = speed * time - GRAVITY * TIMESTEP**2 * steps * (steps + 1) / 2
+    assert document["theta"] == str(speed) and document["onsets"] == 0
+    assert document["gradient_norm"] == pytest.approx(time * rise, rel=0.01)
+    assert json.loads((folder / "diagnosis.json").read_text()) == document
+    page = (folder / "diagnosis.txt").read_text().splitlines()
+    assert page[2].endswith(f"65 steps of 0.002 s, at theta {speed:g}")
+    printed = [line.removeprefix("  > mjx-study ").split() for line in page if line.startswith("  > ")]
+    steps_only = [each for each in printed if each[0] == "gradcheck" and "--mean" not in each]
+    assert len(steps_only) == 1 and "--theta" not in steps_only[0]
+    assert len(printed) > 2 and all("--theta" in each for each in printed if each not in steps_only)
+    assert cli.main(["gradcheck", name, "--theta", "1"]) == 2 and cli.main([*command, "--theta", "1,2"]) == 2
+
+
 @pytest.mark.slow
 def test_the_advised_impedance_avoids_the_bias(found: Diagnosis, tmp_path: Path) -> None:
     (text,) = (text for text in advised(found) if "solimp" in text)
@@ -155,7 +175,8 @@ def test_the_commands_on_the_page_repeat_it(model: str, capsys: pytest.CaptureFi
 
 def planted(**changes: object) -> Measured:
     numbers = {"estimator": "fobg", "variance": 4.0, "lower": 3.0, "upper": 5.0, "seconds": 0.01}
-    return Measured(**(numbers | {"paths": (), "verdict": "unbiased", "bias": 0.0, "norm": 2.0, "lost": 0} | changes))  # type: ignore[arg-type]
+    numbers |= {"paths": (), "verdict": "unbiased", "off": 0.0, "off_error": 0.0, "bias": 0.0, "norm": 2.0, "lost": 0}
+    return Measured(**(numbers | changes))  # type: ignore[arg-type]
 
 
 def test_samples_fill_whole_calls_within_the_budget() -> None:
@@ -230,8 +251,10 @@ def test_when_the_onset_term_cannot_be_trusted(
 
 
 def test_biases_without_the_usual_explanation(found: Diagnosis) -> None:
-    left = advised(found, estimators=with_estimator(found, "fobg_onset", verdict="biased", bias=2 * found.norm))
-    assert any("the onset term leaves a bias of 200 %" in text for text in left)
+    off = {"bias": 2 * found.norm, "off": 2 * found.norm, "off_error": 0.3 * found.norm}
+    left = advised(found, estimators=with_estimator(found, "fobg_onset", verdict="biased", **off))
+    error = 100 * math.hypot(0.3, 2 * found.norm_error / found.norm)
+    assert any(f"the onset term leaves a bias of 200 ± {error:.0f} %" in text for text in left)
     assert not any("corrects that" in text for text in left)
     smooth = advised(found, touches=tuple(dataclasses.replace(each, jump=1e-5) for each in found.touches))
     assert any("though force sets in without a jump" in text for text in smooth)
@@ -245,14 +268,18 @@ def test_a_bias_under_another_law_is_laid_to_something_else(found: Diagnosis) ->
     assert text.startswith("plain first order is biased by") and "something else jumps" in text
 
 
-def test_nothing_is_advised_or_judged_without_a_significant_gradient(found: Diagnosis) -> None:
+def test_without_a_significant_gradient_zeroth_order_is_advised_and_no_mean_judged(found: Diagnosis) -> None:
     """Errors are then absolute; twice the standard error takes four times the samples."""
-    unseen = dataclasses.replace(found, estimators=tuple(planted(estimator=name, norm=0.1) for name in ESTIMATORS))
+    unseen = tuple(planted(estimator=name, norm=0.1, verdict="undecided") for name in ESTIMATORS[1:])
+    unseen = dataclasses.replace(found, seconds=10.0, estimators=(planted(estimator="zobg", norm=0.1), *unseen))
     ((text, flags),) = advise(unseen)
-    assert text.startswith("no estimator can be recommended") and not flags
+    assert text.startswith("at sigma = 0.05 m/s, take zobg: it is unbiased") and not flags
+    assert "If the gradient's norm is 0.1, a relative error of 100 % needs 400 samples and one of 10 % 40,000;" in text
+    assert text.endswith("not significantly different from 0: the others are undecided")
     page, norm_error = page_lines(unseen), 2 / math.sqrt(500)
-    assert f"its norm is 0.100 ± {norm_error:.3f}; --samples 1600 would resolve one of 0.1, and a larger" in page[3]
+    assert f"is 0.100 ± {norm_error:.3f}; --samples 1600 (32 s here) would resolve one of 0.1, and a larger" in page[3]
     table = page[page.index("estimators, by their error, in the gradient's unit, after a second of computing") :]
+    table = table[: table.index("advice")]
     assert table[2].split()[:4] == ["zobg", "0.20", "0.17", "to"]
     assert not any("%" in line.replace("95 %", "") for line in table) and not any("right" in line for line in table)
     document = document_of(unseen)
@@ -261,8 +288,67 @@ def test_nothing_is_advised_or_judged_without_a_significant_gradient(found: Diag
     right = dataclasses.replace(unseen.best, estimator="fobg", verdict="right")
     judged = page_lines(dataclasses.replace(unseen, estimators=(right, *unseen.estimators[1:])))
     assert any("not judged" in line for line in judged) and any("a smaller --sigma" in line for line in judged)
-    nothing = planted(variance=0.0, lower=0.0, upper=0.0, norm=0.0)
-    assert page_lines(dataclasses.replace(found, estimators=(nothing,)))[3].startswith("the gradient is 0: ")
+    (text, _), *_ = advise(dataclasses.replace(unseen, estimators=(unseen.best, right, *unseen.estimators[2:])))
+    assert "take zobg: it is unbiased" in text
+    precise = dataclasses.replace(right, variance=3.9)
+    (text, _), *_ = advise(dataclasses.replace(unseen, estimators=(unseen.best, precise, *unseen.estimators[2:])))
+    assert "take fobg: its mean is right" in text
+    off = dataclasses.replace(right, verdict="biased", off=3.0, off_error=0.2, bias=3.0)
+    told = dataclasses.replace(unseen, estimators=(unseen.best, off, *unseen.estimators[2:]))
+    assert advise(told).__next__()[0].endswith("the means of fobg are off, by an unknown share")
+    assert any("off by 3.00 ± 0.20 in the gradient's unit" in line for line in page_lines(told))
+    nothing = dataclasses.replace(found, estimators=(planted(variance=0.0, lower=0.0, upper=0.0, norm=0.0),))
+    assert page_lines(nothing)[3].startswith("the gradient is 0: ")
+    rare = dataclasses.replace(found, estimators=(planted(variance=math.inf, estimator="zobg"),))
+    for one, why in ((nothing, "the gradient is 0"), (rare, "no estimator without visible bias has a finite variance")):
+        ((text, _),) = advise(one)
+        assert text.startswith(f"no estimator can be recommended: {why};")
+
+
+def crossed(gap: float, error: float, quadrature: float = 0.0, effective: float = 100.0) -> Circulation:
+    """A check of a mean along a path over which the mean cost differs by 1."""
+    return Circulation(*map(jnp.asarray, (1.0, gap, error, quadrature, effective, 1.0, 0)))
+
+
+@pytest.mark.parametrize(
+    ("path", "factor"),
+    [
+        (crossed(0.0, 0.01), 1.0),  # right
+        (crossed(0.2, 0.01), 1.0),  # biased
+        (crossed(0.01, 0.02), (3.29 * 0.02 / 0.04) ** 2),
+        (crossed(0.04, 0.02), (3.29 * 0.02 / 0.04) ** 2),
+        (crossed(0.01, 0.02, quadrature=0.01), (3.29 * 0.02 / 0.03) ** 2),
+        (crossed(0.01, 0.02, quadrature=0.1), math.inf),
+        (crossed(0.2, 0.01, effective=1.0), 3.0),
+    ],
+)
+def test_a_verdict_needs_so_many_times_the_samples(path: Circulation, factor: float) -> None:
+    assert path.more_samples() == pytest.approx(factor)
+    if 1 < factor < math.inf:  # a standard error falls with the root of the number of samples
+        enough = path.standard_error / math.sqrt(1.01 * factor), path.effective * 1.01 * factor
+        assert dataclasses.replace(path, standard_error=enough[0], effective=enough[1]).verdict() != "undecided"
+
+
+def test_samples_are_drawn_until_the_verdict_is_had_or_time_is_up(found: Diagnosis) -> None:
+    def open_to(path: Circulation, seconds: float, **changes: Any) -> int:
+        first = planted(verdict="undecided", paths=(path,), **changes)
+        best = planted(estimator="zobg", variance=5.0)
+        return more_samples(Measurement(500, seconds, {}, 0, (best, first)))
+
+    assert open_to(crossed(0.01, 0.02), 1.0) == 4 and open_to(crossed(0.01, 0.02), 10.0) == 0
+    assert open_to(crossed(0.01, 0.03), 1.0) == 8 and open_to(crossed(0.01, 0.06), 1.0) == 0  # 32 exceed the most
+    assert open_to(crossed(0.01, 0.02, quadrature=0.1), 1.0) == 0
+    assert open_to(crossed(0.01, 0.02), 1.0, variance=6.0) == 0  # it cannot be the best
+    unseen = Measurement(500, 1.0, {}, 0, (planted(estimator="zobg", norm=0.1),))
+    assert more_samples(unseen) == 4 and more_samples(dataclasses.replace(unseen, seconds=8.0)) == 0
+
+
+def test_the_page_says_how_many_samples_would_decide(found: Diagnosis) -> None:
+    for quadrature, expected in ((0.0, "about --samples 1400 (27 s here) would"), (0.1, "gradcheck --mean --span")):
+        paths = (crossed(0.01, 0.02, quadrature=quadrature),)
+        unsure = with_estimator(found, found.best.estimator, verdict="undecided", paths=paths)
+        (text,) = (text for text in cautions(dataclasses.replace(found, estimators=unsure, seconds=10.0)))
+        assert text.startswith("500 samples do not decide if the mean of") and expected in text
 
 
 @pytest.mark.parametrize(
@@ -314,17 +400,19 @@ def test_a_bias_is_not_averaged_away(found: Diagnosis) -> None:
     """10 % with a bias of 8 % needs variance / 0.06^2 samples, and cannot be had with one of 30 %."""
     some = found.best.variance / (0.06 * found.norm) ** 2
     for bias, expected in ((0.08, some), (0.3, math.inf)):
-        estimators = with_estimator(found, found.best.estimator, bias=bias * found.norm)
+        off = {"bias": bias * found.norm, "off": bias * found.norm, "off_error": 0.05 * found.norm}
+        estimators = with_estimator(found, found.best.estimator, **off)
         assert dataclasses.replace(found, estimators=estimators).samples_needed == pytest.approx(expected)
-    assert advised(found, estimators=estimators)[0].endswith("its bias of 30 % remains, however many samples")
+    assert advised(found, estimators=estimators)[0].endswith("its bias of 30.0 ± 5.0 % remains, however many samples")
 
 
 def test_a_mean_that_is_not_judged_is_not_called_biased(found: Diagnosis) -> None:
     name = found.best.estimator
-    unsure = with_estimator(found, name, bias=0.3 * found.norm, verdict="undecided")
+    off = {"bias": 0.3 * found.norm, "off": 0.3 * found.norm, "off_error": 0.2 * found.norm}
+    unsure = with_estimator(found, name, **off, verdict="undecided")
     best = advised(found, estimators=unsure)[0]
     assert "its bias" not in best and f"take {name};" in best
-    assert best.endswith("whether its mean is right is undecided (it may be off by 30 %): more --samples decide that")
+    assert best.endswith("whether its mean is right is undecided: it is off by 30 ± 20 % along the paths")
 
 
 def test_no_command_is_printed_twice(found: Diagnosis) -> None:

@@ -126,6 +126,21 @@ def test_every_kind_of_figure_marks_what_its_limits_clip() -> None:
     assert "beyond the axis (hollow: its interval)" in legend_of(landscape)
 
 
+def test_a_slope_that_is_not_resolved_sets_no_limits_unless_none_is() -> None:
+    one, rising = [("penalty", 10.0)], along("point", *range(41)) * 1.0
+
+    def lower(**slopes: Any) -> Axes:
+        (figure,) = plot_study(study("landscapes", one, smoothed=rising, **slopes)).values()
+        return figure.axes[1]
+
+    mixed = lower(slope=along("estimator", 2.0, -0.1, -0.1), slope_se=along("estimator", 3.0, 0.01, 0.01))
+    low, high = mixed.get_ylim()
+    assert -0.2 < low < -0.1 and 0.0 < high < 0.01
+    assert [text.get_text() for text in mixed.texts] == ["ZoBG not resolved (± 5.9)"]
+    none = lower(slope=along("estimator", 2.0, -0.1, -0.1), slope_se=3.0)
+    assert none.get_ylim()[1] > 2.0 and none.texts[0].get_text().count("not resolved") == 3
+
+
 def crosses(axes: Axes) -> list[tuple[float, bool]]:
     """Crosses at the edges: where along x, and whether above."""
     drawn = [each for each in axes.lines if each.get_label() == UNDRAWN]

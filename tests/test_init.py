@@ -65,6 +65,7 @@ LIMITED: Final = PENDULUM.replace('damping=".01"', 'limited="true" range="-20 20
     '<actuator><motor joint="swing"/></actuator>', ""
 )
 WHEEL: Final = PENDULUM.replace("0 0 0 .1 0 -.5", "0 -.1 0 0 .1 0")
+SHAKY: Final = PENDULUM.replace('motor joint="swing"', 'position joint="swing" kv="9"').replace(".3", "1e-3")
 UNNAMED: Final = BALL.replace('name="ball"', "").replace('name="floor"', "")
 PILE: Final = (
     f'<mujoco model="pile">{FLOOR}'
@@ -204,6 +205,22 @@ def test_a_wheel_on_its_axle_is_to_turn() -> None:
     assert (found.aim.body, found.aim.axis) == (None, 0) and found.aim.distance > 0.01
 
 
+def test_a_coordinate_is_named_by_its_joint(begin: Callable[..., Begun]) -> None:
+    task, _, written, found = begin(WHEEL)
+    distance = f"{found.aim.distance:g} rad"
+    assert task.description == f"move swing by {distance}; open-loop controls"
+    assert f"The goal is {distance} away." in written.read_text() and "# By itself swing ends at" in written.read_text()
+
+
+def test_a_load_that_hardly_moves_is_no_task() -> None:
+    """The arm falls on top of a block, which it presses and tilts by a fraction of a milliradian."""
+    block = """<body name="block" pos="0.55 0 0.1"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+      <joint axis="0 1 0"/><geom name="block" type="box" size="0.1 0.1 0.1" mass="0.5" contype="3" conaffinity="3"/>"""
+    arm, _, rest = ARM.partition('<body name="ball"')
+    aim = proposed(arm + block + "</body></worldbody>" + rest.partition("</worldbody>")[2]).aim
+    assert aim.role == "tip" and aim.distance > 0.01
+
+
 def test_a_learning_rate_lowers_the_cost() -> None:
     found = proposed(LEG)
     aim, drive, steps = found.aim, found.drive, found.horizon
@@ -223,6 +240,7 @@ def test_a_learning_rate_lowers_the_cost() -> None:
         ('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>', "has no degree of freedom"),
         (PENDULUM.replace('damping=".01"', 'armature="1e12"'), "noise on its controls of .* moves not"),
         (PENDULUM.replace('damping=".01"', 'stiffness="1e300" springref="90"'), "state is not finite after step"),
+        (SHAKY, "by a smaller timestep, armature, or the integrator implicitfast"),
         ("<mujoco>", "is not a valid MJCF"),
     ],
 )

@@ -52,6 +52,16 @@ def test_the_page_has_the_tables_of_the_data() -> None:
     for name in learning.TASKS:
         for written in (learning.table, learning.grid_table):
             assert written(lines, name) in (DOCS / "robots.md").read_text()
+    law, default = (
+        next(line for line in lines if (line["what"], line["method"]) == ("spread", method))
+        for method in ("fobg_law", "fobg")
+    )
+    (half, rare, _), (usual, far, _) = law["quantiles"], default["quantiles"]
+    written = (DOCS / "robots.md").read_text()
+    assert f"longer than {rare:,.0f} (MuJoCo's default: {far:.0f}; medians {half:.0f} and {usual:.0f})" in " ".join(
+        written.split()
+    )
+    assert f"cosines of {min(law['cosines']):.2f} to {max(law['cosines']):.2f}" in written
     assert learning.best(lines, "walk", "fobg_onset") == [0.01, 8]
     assert learning.best(lines, "hopper", "fobg_onset")[0] > 2 * learning.best(lines, "hopper", "fobg")[0]
 

@@ -17,6 +17,7 @@ from mjx_study.cli import motions, rollout
 from mjx_study.cli import options as shared
 from mjx_study.objective import Simulator
 from mjx_study.simulation.engine import quiet_engine
+from mjx_study.simulation.names import coordinates
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 from tests.documents import stages_of
@@ -80,6 +81,23 @@ def test_a_trajectory_has_every_state_and_control(capsys: pytest.CaptureFixture[
     # The pusher starts at 0, and the slider's joint is 1 where its body is at 1.
     assert facts["bodies"]["pusher"] == pytest.approx([data["qpos"][-1, 0], 0, 0])
     assert facts["bodies"]["slider"] == pytest.approx([data["qpos"][-1, 1], 0, 0])
+    assert list(facts["qpos"].values()) == data["qpos"][-1].tolist()
+    assert call(*SHORT) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for name, value in facts["qpos"].items():
+        assert [name, f"{value:.4f}", "m"] in lines
+
+
+def test_coordinates_are_named_by_their_joints() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><freejoint name="root"/><geom size=".1"/>
+        <body><joint type="ball" pos="1 0 0"/><geom size=".1"/>
+        <body name="arm"><joint/><joint name="out" type="slide"/><geom size=".1"/></body></body></body></worldbody>
+        </mujoco>"""
+    )
+    places, turns = [(f"root, {axis}", "m") for axis in "xyz"], [(f"root, q{axis}", "") for axis in "wxyz"]
+    ball = [(f"joint 1, q{axis}", "") for axis in "wxyz"]
+    assert coordinates(model) == [*places, *turns, *ball, ("joint 2 of arm", "rad"), ("out", "m")]
 
 
 def test_pictures_and_film_are_whole(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:

@@ -18,9 +18,8 @@ MOVED: Final = 1e-6
 TYPICAL: Final = 1.5
 """Standard deviation of normal numbers in median absolute deviations; a single fall or throw does not count."""
 LEAST: Final = 0.02
-"""Least distance of a goal, in extents of the model."""
-SCALAR: Final = int(mujoco.mjtJoint.mjJNT_SLIDE)
-"""The first type of joint with one coordinate."""
+"""Least distance of a goal, in extents of the model, or of a body's own coordinate [rad]."""
+HINGE: Final = int(mujoco.mjtJoint.mjJNT_HINGE)
 BEYOND: Final = 0.25
 """Share of that distance over which held controls must move a body for it to have a goal."""
 REACHED: Final = 0.25
@@ -72,7 +71,7 @@ def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequenc
         ends, far = (np.array([each.centres[steps, body] for each in trials]) for trials in (noisy, held))
         spread = TYPICAL * np.median(np.abs(far - np.median(far, axis=0)), axis=0)
         hardly = np.ptp(far, axis=0).max() < BEYOND * LEAST * drive.host.stat.extent  # as of a wheel on its axle
-        if hardly and (aim := _coordinate(quiet, noisy, held, steps, _own_coordinates(drive.host, body))):
+        if hardly and (aim := _coordinate(quiet, noisy, held, steps, _own_hinges(drive.host, body), LEAST)):
             return aim
         if not hardly and np.std(ends, axis=0).max() > MOVED:
             axis = 0 if spread[0] >= FORWARD * spread.max() else int(np.argmax(spread))
@@ -83,23 +82,23 @@ def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequenc
 
 
 def _coordinate(
-    quiet: Trial, noisy: Sequence[Trial], held: Sequence[Trial], steps: int, among: Sequence[int]
+    quiet: Trial, noisy: Sequence[Trial], held: Sequence[Trial], steps: int, among: Sequence[int], least: float = MOVED
 ) -> Aim | None:
-    """The coordinate among some that noise moves most; None if it moves none."""
+    """The coordinate among some that noise moves most; None if it moves none, or held controls less than the least."""
     if not among:
         return None
     ends, far = (np.array([each.qpos[steps] for each in trials]) for trials in (noisy, held))
     axis = max(among, key=lambda each: float(np.std(ends[:, each])))
-    if min(np.std(ends[:, axis]), np.std(far[:, axis])) <= MOVED:
+    if np.std(ends[:, axis]) <= MOVED or np.std(far[:, axis]) <= least:
         return None
     end, distance = round(float(quiet.qpos[steps, axis]), 9) + 0.0, rounded(float(np.std(far[:, axis])), 1)
     return Aim(None, "coordinate", axis, (end,), distance, _side(far[:, axis], end))
 
 
-def _own_coordinates(host: mujoco.MjModel, body: int) -> list[int]:
-    """Indices in qpos of a body's hinges and slides."""
+def _own_hinges(host: mujoco.MjModel, body: int) -> list[int]:
+    """Indices in qpos of a body's hinges."""
     joints = range(host.body_jntadr[body], host.body_jntadr[body] + host.body_jntnum[body])
-    return [int(host.jnt_qposadr[each]) for each in joints if host.jnt_type[each] >= SCALAR]
+    return [int(host.jnt_qposadr[each]) for each in joints if host.jnt_type[each] == HINGE]
 
 
 def _side(ends: np.ndarray, end: float) -> int:

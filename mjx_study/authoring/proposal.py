@@ -103,10 +103,10 @@ def propose(scene: Scene) -> Proposal:
         raise ValueError(f"{scene.name} has no degree of freedom: there is nothing to study")
     drive = _drive(host)
     quiet = run_trial(drive, np.zeros((1, drive.size)), _longest(host))
-    if quiet.steps < FEWEST:
+    if quiet.steps < _longest(host):
         raise ValueError(
             f"{scene.name}: the state is not finite after step {quiet.steps} of a test rollout in C; mend its MJCF "
-            "first: mjx-study rollout shows the motion"
+            "first, by a smaller timestep, armature, or the integrator implicitfast: mjx-study rollout shows the motion"
         )
     steps = _horizon(host, quiet)
     aim, noisy, held = None, [], []
@@ -157,9 +157,8 @@ def _horizon(host: mujoco.MjModel, quiet: Trial) -> int:
     """Twice the time to the first contact that begins after the start, but at least the usual duration."""
     begun = [touch.first for touch in quiet.touches.values() if 1 < touch.first < MOST / 1.5]
     wanted = max(2 * min(begun, default=0), USUAL / host.opt.timestep)
-    most = min(MOST, quiet.steps)
-    steps = int(min(most, max(FEWEST, wanted)))
-    return steps if steps == most else min(most, math.ceil(steps / 10) * 10)
+    steps = int(min(MOST, max(FEWEST, wanted)))
+    return min(MOST, math.ceil(steps / 10) * 10)
 
 
 def _trials(drive: Drive, steps: int) -> tuple[list[Trial], list[Trial]]:

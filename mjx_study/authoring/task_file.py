@@ -13,6 +13,7 @@ import mujoco
 from mjx_study.authoring.proposal import HELD, ITERATIONS, PACE, SAMPLES, TRIALS, WEIGHT, Proposal
 from mjx_study.authoring.trial import Touch
 from mjx_study.simulation.contact_pair import geom_label
+from mjx_study.simulation.names import coordinates
 from mjx_study.table import number
 
 IMPORTED: Final = frozenset({"Path", "jnp", "replace", "study"})
@@ -40,8 +41,9 @@ def source_of_task(mjcf: Path, found: Proposal) -> str:
     pages = jinja2.Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     pages.filters |= {"comment": _comment, "quoted": _quoted, "floats": _floats, "number": number, "g": "{:g}".format}
     body = None if aim.body is None else host.body(aim.body).name
-    subject = f"qpos[{aim.axis}]" if body is None else body or f"body {aim.body}"
-    unit = "" if body is None else f" m along {'xyz'[aim.axis]}"
+    joint, unit = coordinates(host)[aim.axis] if body is None else ("", "m")
+    unit = f" {unit}".rstrip()
+    subject = joint or body or f"body {aim.body}"
     by_time = sorted(found.touches.items(), key=lambda item: item[1].first)
     return pages.from_string(Path(__file__).with_suffix(".jinja").read_text()).render(
         {"HELD": HELD, "ITERATIONS": ITERATIONS, "MOST_LISTED": MOST_LISTED, "SAMPLES": SAMPLES, "TRIALS": TRIALS},
@@ -54,12 +56,15 @@ def source_of_task(mjcf: Path, found: Proposal) -> str:
         aim=aim,
         name=name,
         body=body,
+        joint=joint,
+        unit=unit,
         place=f"{module_name(mjcf)}:{name}",
         swept=found.pair is not None,
         timestep=found.scene.timestep,
         touches=[_touch(found, pair, touch) for pair, touch in by_time],
         actuators=[_actuator(host, index) for index in range(host.nu)],
-        description=f"move {_comment(subject)} by {aim.distance:g}{unit}; "
+        description=f"move {_comment(subject)} by {aim.distance:g}{unit}"
+        + (f" along {'xyz'[aim.axis]}; " if body is not None else "; ")
         + ("initial velocities" if drive.at_start else "open-loop controls"),
     )
 

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mjx_study.limits import LARGEST_COORDINATE
 from mjx_study.simulation.engine import quiet_engine
 
 SECONDS: Final = 2.0
@@ -96,7 +97,7 @@ def run_trial(drive: Drive, change: Float[np.ndarray, "rows size"], steps: int) 
             mujoco.mj_step(host, data)
             _note(host, data, step, touches, limits)
             mujoco.mj_kinematics(host, data)
-            if not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
+            if not (np.abs([*data.qpos, *data.qvel]) < LARGEST_COORDINATE).all():
                 break
             centres.append(data.xipos.copy())
             qpos.append(data.qpos.copy())

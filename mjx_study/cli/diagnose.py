@@ -1,12 +1,15 @@
 """mjx-study diagnose."""
 
 import argparse
+import json
 import shlex
+from pathlib import Path
 
 from mjx_study.choices import FAMILIES, is_file
-from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
-from mjx_study.cli.output import computing, print_report
+from mjx_study.cli.options import configure_process, given_options, task_at_theta, usage_errors
+from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.diagnose.columns import CONTACTS, DISTANCE, ESTIMATES, TOUCHES
+from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.options.parser import MIDDLE, TASK_OPTIONS, Parser
 from mjx_study.table import explain
@@ -16,6 +19,7 @@ examples:
   mjx-study diagnose momentum_transfer --contact mujoco_default
   mjx-study diagnose momentum_transfer --contact kelvin_voigt
   mjx-study diagnose robot.xml                 no cost is needed: one is made from the bodies' positions
+  mjx-study diagnose robot_task:robot --theta out/policy-fobg.json       at the end of a descent
 
 columns of the contacts and of the estimators:
 {explain(*TOUCHES, *CONTACTS, DISTANCE, *ESTIMATES)}
@@ -29,7 +33,11 @@ code 1 if a derivative is wrong.
 def add(command: Parser) -> None:
     command.add_task_options()
     command.add_contact_options(MIDDLE, many=False, analytic=False)
-    command.add_option("samples", many=False, interval="[1, 1e7]", unset="500, or as many as fit into a minute")
+    command.add_option(
+        "samples", many=False, interval="[1, 1e7]", unset="500, or what a verdict needs, within a minute"
+    )
+    command.add_theta_option("parameters at which gradients are taken")
+    command.add_argument("--output", type=Path, metavar="DIR", help="folder for the page (diagnosis.txt) and the JSON")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -39,10 +47,13 @@ def run(options: argparse.Namespace) -> int:
 
     with usage_errors():
         configure_process(options)
-        task = task_of(options)
+        task = task_at_theta(options)
+        folder = options.output and prepare_folder(options.output)
         given = options.contact, options.stiffness, options.damping, options.smoothing
         contact, _ = single_contact(task, *given)
-    given = given_options(options, "contact", "stiffness", "damping", "smoothing", "sigma", *TASK_OPTIONS, "seed")
+    given = given_options(
+        options, "contact", "stiffness", "damping", "smoothing", "sigma", *TASK_OPTIONS, "seed", "theta"
+    )
     if not is_file(options.task):  # other commands default to several
         given["contact"] = contact.family
         if FAMILIES[contact.family].swept:
@@ -58,11 +69,17 @@ def run(options: argparse.Namespace) -> int:
             smoothing=options.smoothing,
             samples=options.samples,
             seed=options.seed or 0,
+            theta=options.theta or "",
             options=flags,
             progress=progress,
         )
-    print_report(options, document_of(found), page_lines(found))
-    return 0 if found.derivatives.passed else 1
+    document, lines, unwritten = document_of(found), page_lines(found), None
+    if folder is not None:
+        texts = {"diagnosis.txt": "\n".join(lines), "diagnosis.json": json.dumps(document, allow_nan=False)}
+        write = lambda: [write_whole(folder / name, f"{text}\n".encode()) for name, text in texts.items()]  # noqa: E731
+        written, unwritten = attempt(write)
+        lines = [*lines, *([f"written to {folder}: {', '.join(path.name for path in written)}"] if written else [])]
+    return max(print_report(options, document, lines, unwritten), 0 if found.derivatives.passed else 1)
 
 
 def _text(value: str | int | float | tuple[str, ...]) -> str:

@@ -137,7 +137,7 @@ class Display:
         the first advance, which includes building."""
         if building := self._activity.describe():
             return building
-        share = f", {self._done} of {self._total}" if self._total > 1 else ""
+        share = f", {self._done} of {self._total}" if self._total > 1 else f": {self._what}"
         known = self._first[0] < self._last[0]
         (first, begun), (last, moved) = self._first if known else self._begun, self._last
         if first < last < self._total:

@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, is_file
-from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
+from mjx_study.cli.options import configure_process, given_options, task_at_theta, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import MEANS
 from mjx_study.options.configuration import OPTIONS
@@ -72,6 +72,7 @@ def add(command: Parser) -> None:
     command.add_contact_options(f"{usual}, or the task's if stiffer", families, analytic=False)
     command.add_option(PAIR)
     command.add_builder_options(horizon={"unset": f"the task's; {CHECKED_STEPS} for a file"})
+    command.add_theta_option("parameters whose rollout is checked")
     command.add_option(STATES)
     command.add_flag("--stock", "also check the derivative of mjx.step itself")
     command.add_flag("--mean", "check the means of estimators instead of derivatives")
@@ -84,13 +85,18 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 
-    given = [name for name in (*MEAN_OPTIONS, *DERIVATIVES) if getattr(options, name) not in (None, False)]
+    given = [name for name in (*MEAN_OPTIONS, *DERIVATIVES, "theta") if getattr(options, name) not in (None, False)]
     with usage_errors():
         reject_unused(
             given,
             (DERIVATIVES, not options.mean, "is for derivatives of steps: omit it, or --mean"),
             (MEAN_OPTIONS, options.mean, "is for --mean"),
             (["pair"], is_file(options.task), "is for files: a task has a pair of geoms already"),
+            (
+                ["theta"],
+                options.mean or not is_file(options.task),
+                "is for a task, or for --mean: a file has no policy",
+            ),
         )
     if options.mean:
         return _run_mean(options)
@@ -99,7 +105,7 @@ def run(options: argparse.Namespace) -> int:
     common["states"] = options.states or CHECKED_STATES
     with usage_errors():
         configure_process(options)
-        task = task_of(options)
+        task = task_at_theta(options)
         if not is_file(options.task):
             plan = plan_gradcheck(task, options.contact, options.stiffness, **common)
         else:
@@ -124,7 +130,7 @@ def _run_mean(options: argparse.Namespace) -> int:
     names, onset, seed = chosen["estimators"], chosen["onset"], options.seed or 0
     with usage_errors():
         configure_process(options)
-        task = task_of(options).replace(onset=onset)
+        task = task_at_theta(options).replace(onset=onset)
         given = {"damping": options.damping, "smoothing": options.smoothing}
         plan = plan_gradcheck(task, options.contact, options.stiffness, seed=seed, **given)
         settings = {name: chosen[name] for name in REQUIRED_OPTIONS}

@@ -18,13 +18,14 @@ from mjx_study.cli.options import configure_process, given_options, task_of, the
 from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.experiment.resolution import at_theta
-from mjx_study.limits import MOST_STEPS, check_count
+from mjx_study.limits import LARGEST_COORDINATE, MOST_STEPS, check_count
 from mjx_study.options.configuration import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.options.option import OptionError
 from mjx_study.options.parser import UsageError
 from mjx_study.options.rules import reject_unused
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
+from mjx_study.simulation.names import coordinates
 from mjx_study.simulation.scene import load_model
 from mjx_study.table import format_table, number
 from mjx_study.tasks.contact_grid import ContactPoint, single_contact
@@ -36,9 +37,7 @@ FILE_SECONDS: Final = 2.0
 OF_TASKS: Final = ("contact", "stiffness", "damping", "smoothing", "noisy", "sigma", "theta", "model", "seed")
 """Options that a file does not read."""
 MOST_BODIES_LISTED: Final = 12
-"""Maximum number of bodies whose final positions are printed."""
-LARGEST_COORDINATE: Final = 1e10
-"""Size of coordinates and velocities from which a state counts as nonfinite [m, rad, m/s or rad/s], as in MuJoCo."""
+"""Maximum number of bodies, and of joints, whose final positions are printed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,13 +160,16 @@ def _rollout(
     facts: dict[str, Any],
     focus: tuple[int, ...] = (),
 ) -> Rollout:
-    """Build a rollout with the common facts: steps, duration, and final positions of the bodies' centres of mass."""
+    """Build a rollout with the common facts: steps, duration, final joint coordinates, and where bodies end, by their
+    centres of mass."""
     qpos, qvel, controls = np.asarray(qpos, float), np.asarray(qvel, float), np.asarray(controls)
     good = np.all(np.abs(np.concatenate([qpos, qvel], axis=1)) < LARGEST_COORDINATE, axis=1)
     steps, lasting = len(qpos) - 1, len(good) if good.all() else int(np.argmin(good))
     duration = steps * model.opt.timestep
-    facts |= {"steps": steps, "duration": duration, "finite": lasting == len(good), "bodies": {}}
+    facts |= {"steps": steps, "duration": duration, "finite": lasting == len(good), "qpos": {}, "bodies": {}}
     if lasting > 0:
+        names = [name for name, _ in coordinates(model)]
+        facts["qpos"] = dict(zip(names, qpos[lasting - 1].tolist(), strict=True))
         data = mujoco.MjData(model)
         data.qpos[:] = qpos[lasting - 1]
         mujoco.mj_kinematics(model, data)
@@ -208,6 +210,9 @@ def _lines(rollout: Rollout, messages: tuple[str, ...], written: list[Path]) -> 
     if rows:
         lines += format_table(rows[:MOST_BODIES_LISTED], ["ended at", "x [m]", "y [m]", "z [m]"])
     if len(rows) > MOST_BODIES_LISTED:
-        lines.append(f"and {len(rows) - MOST_BODIES_LISTED} more bodies: --json lists them all")
+        lines.append(f"and {len(rows) - MOST_BODIES_LISTED} more: --json lists them all")
+    if 0 < model.njnt <= MOST_BODIES_LISTED:
+        ends = zip(coordinates(model), facts["qpos"].values(), strict=False)
+        lines += format_table([[name, f"{end:.4f}", unit] for (name, unit), end in ends], ["joints at the end", "", ""])
     lines += [f"warning: {message}" for message in messages]
     return lines + [f"written to {path.parent}: {', '.join(each.name for each in written)}" for path in written[:1]]

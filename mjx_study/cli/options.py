@@ -64,6 +64,14 @@ def task_of(options: argparse.Namespace) -> "mjx_study.tasks.task.Task":
     return task if options.sigma is None else task.replace(sigma=options.sigma)
 
 
+def task_at_theta(options: argparse.Namespace) -> "mjx_study.tasks.task.Task":
+    """`task_of`, with the parameters given by `--theta`."""
+    from mjx_study.experiment.resolution import at_theta
+
+    task = task_of(options)
+    return at_theta(task, theta_and_policy(options)[0])
+
+
 def theta_and_policy(
     options: argparse.Namespace,
 ) -> "tuple[tuple[float, ...] | None, mjx_study.options.files.SavedPolicy | None]":

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from typing import Final
 
 from mjx_study.diagnose.measurement import SAMPLES, TARGET_ERROR
-from mjx_study.diagnose.run import Diagnosis, round_up
+from mjx_study.diagnose.run import Diagnosis, enough, round_up
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
-from mjx_study.table import percent
+from mjx_study.table import number, percent
 
 MIN_SAMPLES: Final = 100
 """Number of samples below which the page warns."""
@@ -37,7 +37,7 @@ def cautions(found: Diagnosis) -> Iterator[str]:
     if found.samples < MIN_SAMPLES:
         yield f"{found.samples} samples are few: --samples {SAMPLES} takes longer and resolves more"
     if found.best.verdict == "undecided" and found.resolved:
-        yield f"{found.samples} samples do not decide whether the mean of {found.best.estimator} is right: take more"
+        yield f"{found.samples} samples do not decide if the mean of {found.best.estimator} is right: {_more(found)}"
     if not found.derivatives.passed:
         yield "derivatives of a step are not right (see below): do not trust a first-order estimate"
 
@@ -45,12 +45,7 @@ def cautions(found: Diagnosis) -> Iterator[str]:
 def advise(found: Diagnosis) -> Iterator[Advice]:
     """Recommendations: the best estimator, the bias of first order, and whether its correction can be trusted."""
     if not found.resolved:
-        more = "more --samples may resolve it (see above); or take" if found.norm else "take"
-        yield (
-            f"no estimator can be recommended: with {found.samples} samples the gradient is not significantly "
-            f"different from 0; {more} another start or cost, in a task of your own (docs/extending.md)",
-            "",
-        )
+        yield _unresolved(found), ""
         return
     yield _best(found)
     if not found.onsets.get("onsets"):
@@ -69,13 +64,40 @@ def advise(found: Diagnosis) -> Iterator[Advice]:
         yield from _onset(found)
 
 
+def _more(found: Diagnosis) -> str:
+    """How the verdict on the best estimator's mean can be had."""
+    factor = found.best.more_samples()
+    if math.isinf(factor):
+        return "the mean cost bends too much along a path; take a shorter one (gradcheck --mean --span)"
+    return f"about {enough(found, factor)} would"
+
+
+def _unresolved(found: Diagnosis) -> str:
+    """What can be done where the gradient is not distinguishable from 0."""
+    sound = [each for each in found.estimators if each.verdict in ("unbiased", "right") and each.variance < math.inf]
+    if not found.norm or not sound:
+        why = "no estimator without visible bias has a finite variance" if found.norm else "the gradient is 0"
+        return f"no estimator can be recommended: {why}; take another start or cost, in a task of your own"
+    best = min(sound, key=lambda each: each.error(1.0))
+    whole, tenth = (round_up(best.variance / (share * found.norm) ** 2) for share in (1.0, TARGET_ERROR))
+    why = "it is unbiased, whatever the contact" if best.verdict == "unbiased" else "its mean is right"
+    biased = [each.estimator for each in found.estimators if each.verdict == "biased"]
+    others = f"the means of {', '.join(biased)} are off, by an unknown share" if biased else "the others are undecided"
+    return (
+        f"at {found.setting.level}, take {best.estimator}: {why}. If the gradient's norm is {number(found.norm, 2)}, a "
+        f"relative error of 100 % needs {whole} samples and one of {percent(TARGET_ERROR)} {tenth}; a descent may need "
+        "fewer in an iteration, since errors of its iterations average out (mjx-study optimise). Whether another "
+        f"estimator is better is open, as the gradient is not significantly different from 0: {others}"
+    )
+
+
 def _best(found: Diagnosis) -> Advice:
-    best, bias, needed = found.best, found.bias_text(found.best), ""
+    best, bias, needed = found.best, found.off_text(found.best), ""
     if math.isfinite(found.samples_needed):
         many = round_up(found.samples_needed)
         needed = f"; a relative error of {percent(TARGET_ERROR)} needs {many} sample{'' if many == '1' else 's'}"
     if best.verdict == "undecided":
-        needed += f"; whether its mean is right is undecided (it may be off by {bias}): more --samples decide that"
+        needed += f"; whether its mean is right is undecided: it is off by {bias} along the paths"
     elif not needed:
         needed = f"; its bias of {bias} remains, however many samples"
     elif best.verdict == "biased":
@@ -85,7 +107,7 @@ def _best(found: Diagnosis) -> Advice:
 
 def _bias(found: Diagnosis) -> Advice:
     by_name, timestep = {each.estimator: each for each in found.estimators}, found.task.scene.timestep
-    text = f"plain first order is biased by {found.bias_text(by_name['fobg'])}, "
+    text = f"plain first order is biased by {found.off_text(by_name['fobg'])}, "
     corrected = not found.law and by_name["fobg_onset"].verdict == "right"
     if found.law or max([each.jump for each in found.touches] or [found.onsets["onset_strength"]]) <= SMOOTH_SHARE:
         text += "though force sets in without a jump: something else jumps, as where corners and edges touch, "
@@ -128,7 +150,7 @@ def _onset(found: Diagnosis) -> Iterator[Advice]:
         and (strength <= MOST_STRENGTH)
     ):
         yield (
-            f"the onset term leaves a bias of {found.bias_text(corrected)}, which its own error does not "
+            f"the onset term leaves a bias of {found.off_text(corrected)}, which its own error does not "
             "explain; the usual causes are corners, edges, grazing and rolling contact: take zobg there",
             "",
         )

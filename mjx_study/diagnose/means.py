@@ -6,7 +6,8 @@ steps reveals.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, Final
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
-from estimators.mean_check import TOLERANCE, Circulation, circulations
+from estimators.mean_check import NODES, TOLERANCE, Circulation, circulations
 from estimators.registry import label_of
 from mjx_study.diagnose.columns import MEANS
 from mjx_study.experiment.resolution import check_estimators, direction_of
@@ -41,6 +42,9 @@ ALONG_MEANS: Final = "means"
 MAX_PATHS: Final = 3
 MIN_SHARE: Final = 1e-3
 """Smallest share of a mean orthogonal to the others that warrants a path along it."""
+
+Nodes = Callable[[int, int], None]
+"""Called before each node of the paths with the number of nodes done, and of all."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,22 +91,33 @@ def along_means(
     estimates: Sequence[GradientEstimate],
     samples: int,
     seed: int,
+    progress: Nodes = lambda done, total: None,
 ) -> list[list[Circulation]]:
     """Check means along up to three orthogonal paths, which share the samples; results by path and estimator.
 
     The first path follows the most precise estimate, the others the orthogonal parts of the next ones: only there does
     a bias orthogonal to the gradient show. Their differences of the mean cost are replaced by the first path's, so that
-    all gaps are shares of the gradient.
+    all gaps are shares of the gradient. Progress is reported in nodes.
     """
     paths = [reach * jnp.asarray(unit, theta.dtype) for unit in _at_right_angles(estimates)]
     each = max(2, samples // len(paths))
-    found = [
-        circulations(estimators, objective, theta - along, theta + along, jax.random.key(seed), each) for along in paths
-    ]
+    found = []
+    for done, along in enumerate(paths):
+        node, ends = partial(_node, progress, done, len(paths)), (theta - along, theta + along)
+        found.append(circulations(estimators, objective, *ends, jax.random.key(seed), each, progress=node))
     return [
         [dataclasses.replace(one, difference=first.difference) for one, first in zip(path, found[0], strict=True)]
         for path in found
     ]
+
+
+def in_nodes(progress: Progress, done: int, total: int, what: str) -> Nodes:
+    """Report nodes within one of several pieces of work."""
+    return lambda node, nodes: progress(done, total, f"{what}; means along paths, node {node + 1} of {nodes}")
+
+
+def _node(progress: Nodes, paths_done: int, paths: int, node: int) -> None:
+    progress(NODES * paths_done + node, NODES * paths)
 
 
 def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
@@ -160,12 +175,13 @@ def check_mean(
     simulator = Simulator(task, chunk_size=chunk_for(samples, local_devices(), [task]))
     found, ends = [], (task.theta + low * along, task.theta + high * along)
     for index, cell in enumerate(cells):
-        progress(index, len(cells), cell.label)
+        nodes = in_nodes(progress, index, len(cells), cell.label)
         objective, key = simulator.objective(cell.contact), jax.random.key(seed)
         if direction == ALONG_MEANS:
-            paths = _along_own(estimators, objective, task.theta, reach_of(task), samples, seed)
+            paths = _along_own(estimators, objective, task.theta, reach_of(task), samples, seed, nodes)
         else:
-            paths = [circulations(estimators, objective, *ends, key, samples)]
+            node = partial(_node, nodes, 0, 1)
+            paths = [circulations(estimators, objective, *ends, key, samples, progress=node)]
         found += [
             MeanCheck(cell.family, cell.stiffness_or_zero, name, each, each.verdict(tolerance))
             for numbers in paths
@@ -176,12 +192,18 @@ def check_mean(
 
 
 def _along_own(
-    estimators: Sequence[Estimator], objective: Any, theta: Array, reach: float, samples: int, seed: int
+    estimators: Sequence[Estimator],
+    objective: Any,
+    theta: Array,
+    reach: float,
+    samples: int,
+    seed: int,
+    progress: Nodes,
 ) -> list[list[Circulation]]:
     """`along_means` with estimates from a batch of their own."""
     batches, _, _ = draw_batches(objective, theta, cell_keys(seed, 1), oracles_of(estimators), samples, slice(1))
     estimates = unmixed(estimators, jax.tree.map(lambda leaf: jax.device_put(leaf[0]), batches))
-    return along_means(estimators, objective, theta, reach, estimates, samples, seed)
+    return along_means(estimators, objective, theta, reach, estimates, samples, seed, progress)
 
 
 def check_terms(
@@ -203,11 +225,11 @@ def check_terms(
         if CORRECTED in estimator.needs or (plan.task_of(cell).onset != "none" and reads_onset([estimator]))
     ]
     for index, (cell, name, estimator) in enumerate(chosen):
-        progress(index, len(chosen), cell.model.label)
+        nodes = in_nodes(progress, index, len(chosen), cell.model.label)
         task = plan.task_of(cell).replace(sigma=cell.sigma)
         theta = jnp.asarray(thetas.get(name, task.theta), task.theta.dtype)
         if np.all(np.isfinite(theta)):
-            drawn = cell.samples, plan.config.seed
+            drawn = cell.samples, plan.config.seed, nodes
             ((circulation,),) = _along_own([estimator], objectives(cell), theta, reach_of(task), *drawn)
             place = cell.model.family, cell.model.stiffness_or_zero
             found.append(MeanCheck(*place, name, circulation, circulation.verdict()))

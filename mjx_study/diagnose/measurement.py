@@ -7,6 +7,7 @@ gradient. The bias is the detectable deviation of the estimator's mean from the 
 
 import dataclasses
 import math
+import time
 from typing import Any, Final
 
 import jax
@@ -16,7 +17,8 @@ import numpy as np
 from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
 from estimators.mean_check import NODES
 from mjx_study.compiled import Builds
-from mjx_study.diagnose.means import MAX_PATHS, along_means, reach_of, unmixed
+from mjx_study.diagnose.means import MAX_PATHS, along_means, in_nodes, reach_of, unmixed
+from mjx_study.experiment.memory import fits_in_memory
 from mjx_study.experiment.sampling import cell_keys, draw_batches, unconverged
 from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import BlankObjective, Simulator, chunk_for
@@ -39,6 +41,10 @@ SMALL_MODEL: Final = (8, 32)
 """Maximum numbers of degrees of freedom and constraint rows of a small model."""
 RESOLVED_SE: Final = 2.0
 """Standard errors beyond which a gradient is distinguishable from 0."""
+INTERVAL_SE: Final = 1.96
+"""Half-width of a 95 % interval in standard errors."""
+MOST_SAMPLES: Final = 16 * SAMPLES
+"""Number of samples beyond which no more are drawn without being asked for."""
 TARGET_ERROR: Final = 0.1
 """Relative error for which the page states a number of samples."""
 
@@ -52,8 +58,9 @@ class Measured:
         seconds: computing time per sample [s].
         paths: checks of the mean along paths; none for zeroth order, which is unbiased.
         verdict: verdict on the mean: unbiased by theory, or right, biased or undecided by the check.
-        bias: deviation of the mean along the paths, less its standard error, or if undecided with it (both in squares)
+        off, off_error: deviation of the mean along the paths, less its standard error (in squares), and that error
             [gradient].
+        bias: the same, but if undecided with its standard error added (in squares) [gradient].
         norm: norm of the mean, without what noise adds to it [gradient].
         lost: number of excluded nonfinite samples.
     """
@@ -65,20 +72,26 @@ class Measured:
     seconds: float
     paths: tuple[Circulation, ...]
     verdict: str
+    off: float
+    off_error: float
     bias: float
     norm: float
     lost: int
 
-    @property
-    def bias_error(self) -> float:
-        """Relative standard error of the bias along the worst path."""
-        most = max(self.paths, key=lambda each: abs(float(each.gap)), default=None)
-        return 0.0 if most is None or not most.gap else float(abs(most.standard_error / most.gap))
-
-    def error(self, norm: float, variance: float | None = None) -> float:
-        """Error after a second of computing, relative to a gradient of this norm."""
+    def error(self, norm: float, variance: float | None = None, bias: float | None = None) -> float:
+        """Error after a second of computing, relative to a gradient of this norm; by default that measured."""
         spread = (self.variance if variance is None else variance) * self.seconds
-        return math.hypot(self.bias, math.sqrt(spread)) / norm if norm > 0 else math.inf
+        bias = self.bias if bias is None else bias
+        return math.hypot(bias, math.sqrt(spread)) / norm if norm > 0 else math.inf
+
+    def interval(self, norm: float) -> tuple[float, float]:
+        """95 % interval of `error`, from those of variance and bias."""
+        low, high = (max(self.bias + sign * INTERVAL_SE * self.off_error, 0.0) for sign in (-1, 1))
+        return self.error(norm, self.lower, low), self.error(norm, self.upper, high)
+
+    def more_samples(self) -> float:
+        """Factor by which the number of samples would have to grow for a verdict, as in `Circulation.more_samples`."""
+        return max((each.more_samples() for each in self.paths), default=1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,9 +101,11 @@ class Measurement:
     Attributes:
         onsets: `mjx_study.results.variables.ONSETS` of the first-order batch; empty under a law other than MuJoCo's.
         unconverged: number of rollouts in which the solver did not converge.
+        seconds: time of drawing the samples and checking the means [s].
     """
 
     samples: int
+    seconds: float
     onsets: dict[str, float]
     unconverged: int
     estimators: tuple[Measured, ...]
@@ -120,6 +135,18 @@ class Measurement:
     @property
     def best(self) -> Measured:
         return self.estimators[0]
+
+    @property
+    def open_questions(self) -> list[float]:
+        """Factors by which the number of samples would have to grow to tell the gradient from 0, and to decide about
+        the mean of each estimator that may be the best; none if all of that is known."""
+        resolving = [] if self.resolved or not self.norm else [(RESOLVED_SE * self.norm_error / self.norm) ** 2]
+        rivals = [each for each in self.estimators if each.error(1.0, bias=0.0) <= self.best.error(1.0)]
+        return resolving + [each.more_samples() for each in rivals if each.verdict == "undecided"]
+
+    def time_of(self, samples: float) -> float:
+        """Time of as many samples and checks of the means with them [s]."""
+        return self.seconds * samples / self.samples
 
     @property
     def samples_needed(self) -> float:
@@ -161,7 +188,8 @@ def measure(
 ) -> Measurement:
     """Measure the estimators at the task's theta, without the contacts and step derivatives of a diagnosis.
 
-    The simulator's compiled programs serve every contact model, None being the MJCF's; samples as in `diagnose_task`.
+    The simulator's compiled programs serve every contact model, None being the MJCF's. By default `SAMPLES` samples are
+    drawn, fewer if they would take longer than `BUDGET_SECONDS`, and more where `more_samples` says so.
     """
     task = simulator.task
     chosen = estimators_of(task, contact)
@@ -170,7 +198,7 @@ def measure(
     def drawn(count: int):
         return draw_batches(objective, task.theta, keys, oracles, count, slice(1))
 
-    progress(0, 3, "programs")
+    progress(0, 2, "programs")
     builds = Builds()
     blank = BlankObjective(**vars(objective))
     for oracle in oracles:
@@ -178,27 +206,43 @@ def measure(
     blank.build(builds)
     builds.wait()
     drawn(1)
-    if samples is None:
-        samples = affordable(sum(drawn(1)[1].values()), simulator.chunk_size)
-    progress(1, 3, f"batches of {samples} samples")
-    batches, seconds, residuals = drawn(samples)
-    batches = jax.tree.map(lambda leaf: jax.device_put(leaf[0]), batches)
     reach, first = reach_of(task), [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
-    progress(2, 3, "means along paths")
-    along = along_means(first, objective, task.theta, reach, unmixed(chosen, batches), samples, seed)
-    paths: dict[Estimator, tuple[Circulation, ...]] = dict(zip(first, zip(*along, strict=True), strict=True))
-    found = [
-        _measured(each, batches, sum(seconds[oracle] for oracle in each.needs), paths.get(each, ()), reach, samples)
-        for each in chosen
-    ]
-    onsets = {}
-    if "corrected" in batches:
-        events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
-        onsets = dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True))
-    unsolved = max(unconverged(each, precision()) for each in residuals.values())
-    unordered = Measurement(samples, onsets, unsolved, tuple(found))
-    order = sorted(found, key=lambda each: each.error(unordered.norm))
-    return dataclasses.replace(unordered, estimators=tuple(order))
+
+    def measured(samples: int) -> Measurement:
+        stage, begun = f"{samples} samples", time.perf_counter()
+        progress(1, 2, stage)
+        batches, seconds, residuals = drawn(samples)
+        batches = jax.tree.map(lambda leaf: jax.device_put(leaf[0]), batches)
+        nodes, estimates = in_nodes(progress, 1, 2, stage), unmixed(chosen, batches)
+        along = along_means(first, objective, task.theta, reach, estimates, samples, seed, nodes)
+        paths: dict[Estimator, tuple[Circulation, ...]] = dict(zip(first, zip(*along, strict=True), strict=True))
+        found = [
+            _measured(each, batches, sum(seconds[oracle] for oracle in each.needs), paths.get(each, ()), reach, samples)
+            for each in chosen
+        ]
+        onsets = {}
+        if "corrected" in batches:
+            events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
+            onsets = dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True))
+        unsolved = max(unconverged(each, precision()) for each in residuals.values())
+        unordered = Measurement(samples, time.perf_counter() - begun, onsets, unsolved, tuple(found))
+        order = sorted(found, key=lambda each: each.error(unordered.norm))
+        return dataclasses.replace(unordered, estimators=tuple(order))
+
+    if samples is not None:
+        return measured(samples)
+    found = measured(affordable(sum(drawn(1)[1].values()), simulator.chunk_size))
+    while (factor := more_samples(found)) and fits_in_memory(task, chosen, factor * found.samples):
+        found = measured(factor * found.samples)
+    return found
+
+
+def more_samples(found: Measurement) -> int:
+    """Factor by which to draw more samples, a power of two: it answers the most open questions that `BUDGET_SECONDS`
+    and `MOST_SAMPLES` allow; 0 if it answers none."""
+    most = min(BUDGET_SECONDS / found.seconds, MOST_SAMPLES / found.samples)
+    factors = [2 ** max(1, math.ceil(math.log2(each))) for each in found.open_questions if math.isfinite(each)]
+    return max((each for each in factors if each <= most), default=0)
 
 
 def _measured(
@@ -210,8 +254,12 @@ def _measured(
     squared = float(jnp.sum(estimate.mean**2)) - float(estimate.variance) / samples
     verdicts = {each.verdict() for each in paths}
     verdict = next((each for each in ("biased", "undecided", "right") if each in verdicts), "unbiased")
-    sign = 1 if verdict == "undecided" else -1
-    missed = sum(max(0.0, float(each.gap**2 + sign * each.standard_error**2)) for each in paths)
+    gaps, errors = (np.array([float(getattr(each, name)) for each in paths]) for name in ("gap", "standard_error"))
+    off, bias = (
+        float(np.sqrt(np.sum(np.maximum(gaps**2 + sign * errors**2, 0.0)))) / (2 * reach)
+        for sign in (-1, 1 if verdict == "undecided" else -1)
+    )
+    off_error = float(np.linalg.norm(gaps * errors)) / (float(np.linalg.norm(gaps)) or 1.0) / (2 * reach)
     return Measured(
         estimator=estimator.name,
         variance=float(estimate.variance),
@@ -220,7 +268,9 @@ def _measured(
         seconds=seconds / samples,
         paths=paths,
         verdict=verdict,
-        bias=math.sqrt(missed) / (2 * reach),
+        off=off,
+        off_error=off_error,
+        bias=bias,
         norm=math.sqrt(max(squared, 0.0)),
         lost=int(estimate.num_nonfinite),
     )

@@ -7,17 +7,21 @@ import shlex
 import textwrap
 from typing import Any, Final
 
+from mjx_study.choices import is_file
 from mjx_study.diagnose.advice import advise, cautions
 from mjx_study.diagnose.columns import CONTACTS, DISTANCE, ESTIMATES, TOUCHES
 from mjx_study.diagnose.means import ALONG_MEANS
 from mjx_study.diagnose.measurement import RESOLVED_SE, Measured
-from mjx_study.diagnose.run import Diagnosis, round_up
+from mjx_study.diagnose.run import Diagnosis, enough
 from mjx_study.gradcheck.diagnosis import MEANING
 from mjx_study.runtime import environment
 from mjx_study.table import Column, as_plain, percent, tabulate, with_error
 
 LEGEND: Final = "  zobg: zeroth order; fobg: first order; aobg: both, weighted"
 TERM: Final = "; _onset: with a term for contact that begins or ends"
+UNKNOWN: Final = "unknown"
+NOT_JUDGED: Final = "not judged"
+UNJUDGED: Final = "  not judged: means are judged by shares of the gradient, which is not distinguishable from 0"
 MAX_ERROR: Final = 100.0
 """Upper end beyond which the interval of a relative error is uninformative."""
 MAX_SHOWN: Final = 6
@@ -29,6 +33,7 @@ def document_of(found: Diagnosis) -> dict[str, Any]:
     norm = found.norm if found.resolved else math.nan
     document = {
         "subject": found.subject,
+        "theta": found.theta or None,
         "cost": found.task.description,
         "contact": found.contact,
         "samples": found.samples,
@@ -69,7 +74,7 @@ def page_lines(found: Diagnosis) -> list[str]:
     lines = [
         f"{found.subject}: {found.task.description or found.task.name}",
         f"contact {found.contact}, {found.samples} samples",
-        found.setting.line(),
+        f"{found.setting.line()}{found.theta and f', at theta {found.theta}'}",
         *([] if found.resolved else [_unresolved(found)]),
         *(f"warning: {text}" for text in (*found.warnings, *cautions(found))),
         "",
@@ -78,11 +83,16 @@ def page_lines(found: Diagnosis) -> list[str]:
     ]
     if found.onsets.get("onsets") and not found.law:
         lines.append(f"{compare} --estimators fobg_onset --samples {found.samples} --json")
-    steps = re.sub(r" --sigma \S+", "", check)  # steps have no noise
+    steps = re.sub(r" --sigma \S+", "", check)  # steps have no noise, and those of a file no policy
+    steps = re.sub(r" --theta ('[^']*'|\S+)", "", steps) if is_file(found.subject) else steps
     lines += ["", "derivatives of a step", f"  {_derivatives(found)}", steps]
-    error = "relative error" if found.resolved else "error, in the gradient's unit,"
+    if found.resolved:
+        norm = with_error(found.surest.norm, found.norm_error)
+        heading = f"estimators, by their error relative to the gradient, {norm}, after a second of computing"
+    else:
+        heading = "estimators, by their error, in the gradient's unit, after a second of computing"
     batch = f"--estimators {','.join(each.estimator for each in found.estimators)} --samples {found.samples}"
-    lines += ["", f"estimators, by their {error} after a second of computing", *_estimator_lines(found)]
+    lines += ["", heading, *_estimator_lines(found)]
     lines += [f"{check} --mean --direction {ALONG_MEANS} {batch}", f"{compare} {batch}", "", "advice"]
     for text, flags in advise(found):
         lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
@@ -133,21 +143,25 @@ def _contact_lines(found: Diagnosis) -> list[str]:
 def _estimator_lines(found: Diagnosis) -> list[str]:
     name = Column("  estimator", lambda row: f"  {row[-1]}")
     rows = [(*_estimate(found, each), each.estimator) for each in found.estimators]
-    return [*tabulate(rows, [name, *ESTIMATES]), f"{LEGEND}{'' if found.law else TERM}"]
+    lines = [*tabulate(rows, [name, *ESTIMATES]), f"{LEGEND}{'' if found.law else TERM}"]
+    return [*lines, UNJUDGED] if any(NOT_JUDGED in row for row in rows) else lines
 
 
 def _estimate(found: Diagnosis, each: Measured) -> tuple[str, str, str, str]:
     """Error, its interval, verdict on the mean, and milliseconds."""
-    error, low, high = (each.error(found.scale, end) for end in (None, each.lower, each.upper))
+    error, (low, high) = each.error(1.0), each.interval(1.0)
     uncertainty = math.hypot((high - low) / 4 / error, found.scale_error) if error else 0.0
     shown, least, most = (found.error_text(value, uncertainty) for value in (error, low, high))
-    mean = f"off by {found.bias_text(each)}" if each.verdict == "biased" else each.verdict
+    mean = f"off by {found.off_text(each)}" if each.verdict == "biased" else each.verdict
     judged = found.resolved or each.verdict in ("biased", "unbiased")
-    informative = high * found.scale <= MAX_ERROR * found.norm
     return (
         shown,
-        f"{least} to {most}" if informative else f"at least {least}",
-        mean if judged else "not judged",
+        f"{least} to {most}"
+        if high <= MAX_ERROR * found.norm
+        else f"at least {least}"
+        if low > error / 10
+        else UNKNOWN,
+        mean if judged else NOT_JUDGED,
         f"{1e3 * each.seconds:.3g}",
     )
 
@@ -156,10 +170,10 @@ def _unresolved(found: Diagnosis) -> str:
     """Say that the gradient is not significantly different from 0, and how to resolve it."""
     if not found.norm:
         return "the gradient is 0: no parameter affects the cost"
-    needed = round_up(found.surest.variance * (RESOLVED_SE / found.norm) ** 2).replace(",", "")
+    needed = enough(found, (RESOLVED_SE * found.norm_error / found.norm) ** 2)
     other = "larger" if found.surest.estimator == "zobg" else "smaller"
     return (
         f"the gradient is not significantly different from 0: its norm is "
-        f"{with_error(found.surest.norm, found.norm_error)}; --samples {needed} would resolve one of {found.norm:.1g}, "
+        f"{with_error(found.surest.norm, found.norm_error)}; {needed} would resolve one of {found.norm:.1g}, "
         f"and a {other} --sigma may need fewer"
     )

@@ -12,6 +12,7 @@ from mjx_study.gradcheck import GradcheckReport, gradcheck, plan_gradcheck, plan
 from mjx_study.objective import Simulator
 from mjx_study.progress import Progress, silent
 from mjx_study.simulation.contact import has_mujoco_law
+from mjx_study.table import with_error
 from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
@@ -29,7 +30,7 @@ class Diagnosis(Measurement):
     """Everything measured; `page` formats it.
 
     Attributes:
-        subject: the model as named by the user.
+        subject, theta: the model, and parameters other than the task's, as named by the user.
         contact, warnings: label of the contact model, and warnings about it.
         law, lead: name of its law, None if MuJoCo's, and the time before touch from which it acts [s].
         touches: contacts that begin in the zero-noise rollout.
@@ -37,6 +38,7 @@ class Diagnosis(Measurement):
     """
 
     subject: str
+    theta: str
     task: Task
     setting: RolloutSetting
     contact: str
@@ -60,22 +62,41 @@ class Diagnosis(Measurement):
     def scale_error(self) -> float:
         return self.norm_error / self.norm if self.resolved else 0.0
 
+    @property
+    def unit(self) -> str:
+        """What follows errors: they are shares of the gradient if it is distinguishable from 0."""
+        return " %" if self.resolved else " in the gradient's unit"
+
+    def shown(self, error: float) -> float:
+        """An error [gradient] in `unit`."""
+        return error / self.scale * (100 if self.resolved else 1)
+
     def error_text(self, error: float, uncertainty: float) -> str:
         """Format an error to two significant digits, or to one if its relative standard error is large."""
         digits = 1 if uncertainty > ONE_DIGIT_UNCERTAINTY else 2
-        size = float(f"{error * (100 if self.resolved else 1):.{digits}g}")
+        size = float(f"{self.shown(error):.{digits}g}")
         decimals = digits - 1 - math.floor(math.log10(size)) if size > 0 else 0
         text = f"{size:.{max(decimals, 0)}f}" if -6 < decimals < 6 else f"{size:g}"
         return f"{text}{' %' if self.resolved else ''}"
 
-    def bias_text(self, estimator: Measured) -> str:
-        return self.error_text(estimator.bias / self.scale, math.hypot(estimator.bias_error, self.scale_error))
+    def off_text(self, estimator: Measured) -> str:
+        """Format how far a mean is off, with its standard error, which includes that of the gradient's norm."""
+        error = math.hypot(estimator.off_error, estimator.off * self.scale_error)
+        return f"{with_error(self.shown(estimator.off), self.shown(error))}{self.unit}"
 
 
 def round_up(number: float) -> str:
     """Round up to two significant digits, with thousands separators."""
     digits = max(0, math.floor(math.log10(max(number, 1.0))) - 1)
     return f"{math.ceil(number / 10**digits) * 10**digits:,}"
+
+
+def enough(found: Measurement, factor: float) -> str:
+    """So many times the samples drawn, as an option, and how long they take here."""
+    samples = round_up(factor * found.samples)
+    seconds = found.time_of(factor * found.samples)
+    time = f"{seconds / 60:,.0f} minutes" if seconds > 120 else f"{max(seconds, 1):.0f} s"
+    return f"--samples {samples.replace(',', '')} ({time} here)"
 
 
 def diagnose_task(
@@ -88,6 +109,7 @@ def diagnose_task(
     smoothing: float | None = None,
     samples: int | None = None,
     seed: int = 0,
+    theta: str = "",
     options: str = "",
     progress: Progress = silent,
 ) -> Diagnosis:
@@ -96,8 +118,9 @@ def diagnose_task(
     Args:
         subject: the model as named by the user; for a file, the gradient check covers single steps only.
         family, stiffness, damping, smoothing: of the contact [N/m, N s/m, J]; None for those of a single run.
-        samples: samples per batch, and per node of the paths along which means are checked; None for `SAMPLES`, or as
-            many as fit into `BUDGET_SECONDS`.
+        samples: samples per batch, and per node of the paths along which means are checked; None for `SAMPLES`, or
+            fewer or more as in `measure`.
+        theta: name of the task's theta if it is not its own.
         options: contact options as command-line flags.
 
     Raises:
@@ -128,6 +151,7 @@ def diagnose_task(
     return Diagnosis(
         **vars(found),
         subject=subject,
+        theta=theta,
         task=task,
         setting=setting_of(subject, task),
         contact=cell.label,

@@ -102,7 +102,8 @@ class LandscapeComputation(Computation):
         line = line_of(task, config.settings.points, config.span, config.direction, config.seed)
         keys, columns, solved = cell_keys(config.seed, config.seeds), [], []
         samples, size = np.asarray(config.seeds * cell.samples), plan.padded_samples(cell, config.seeds)
-        for theta in line.thetas(task.theta.dtype):
+        for point, theta in enumerate(line.thetas(task.theta.dtype)):
+            checkpoint.report(point, plan.settings.points, "points of the line")
             drawn, _, residuals = draw_batches(objective, theta, keys, plan.oracles, cell.samples, slice(None))
             solved += residuals.values()
             pooled = jax.tree.map(lambda leaf: leaf.reshape(1, -1, *leaf.shape[2:]), drawn)

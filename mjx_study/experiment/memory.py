@@ -83,12 +83,20 @@ def blocks_take(whole: Sequence[str]) -> str:
     return f"batches of any size are for {', '.join(able)}, without leave_one_out and cross_fitted"
 
 
+def _gib(task: Task, estimators: Sequence[Estimator], samples: int, other: int = 0) -> float:
+    each = bytes_per_sample(task, oracles_of(estimators, "evaluation"), len(estimators), draws=0)
+    return (samples * each + 8 * other) / 2**30
+
+
+def fits_in_memory(task: Task, estimators: Sequence[Estimator], samples: int) -> bool:
+    """Whether the arrays fit into `MOST_GIB`."""
+    return _gib(task, estimators, samples) <= MOST_GIB
+
+
 def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, other: int = 0) -> None:
     """Raise ValueError for arrays that do not fit into `MOST_GIB`, with what to change; `other` is the number of
     further numbers kept."""
-    each = bytes_per_sample(task, oracles_of(estimators, "evaluation"), len(estimators), draws=0)
-    gib = (samples * each + 8 * other) / 2**30
-    if gib > MOST_GIB:
+    if (gib := _gib(task, estimators, samples, other)) > MOST_GIB:
         raise ValueError(
             f"{samples} samples of {task.policy.num_params} parameters and {task.horizon} steps need {gib:.3g} GiB of "
             f"memory, and the limit is {MOST_GIB:g} GiB: use fewer samples, seeds or steps, or split them over several "

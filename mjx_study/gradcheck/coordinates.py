@@ -17,6 +17,7 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.integration import integrate_position
+from mjx_study.simulation.names import joint_name
 from mjx_study.simulation.scene import Scene
 
 PARAMETERS: Final = (
@@ -142,12 +143,6 @@ def _dof_names(host: mujoco.MjModel, joint: int) -> list[str]:
     name, kind = joint_name(host, joint), int(host.jnt_type[joint])
     parts = {_FREE: ("translation", "rotation"), _BALL: ("rotation",)}.get(kind)
     return [f"{name}, {part} {axis}" for part in parts for axis in "xyz"] if parts else [name]
-
-
-def joint_name(host: mujoco.MjModel, joint: int) -> str:
-    """A joint's name, or its body's if it is unnamed."""
-    body = host.body(host.jnt_bodyid[joint]).name
-    return host.joint(joint).name or (f"joint {joint} of {body}" if body else f"joint {joint}")
 
 
 def _parameter_scales(scene: Scene, contact: ContactModel | None) -> Float[np.ndarray, " parameters"]:

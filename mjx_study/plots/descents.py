@@ -14,12 +14,16 @@ from mjx_study.plots.style import line_with_band, robust_limits, style_of
 from mjx_study.results.curves import line_of
 from mjx_study.results.rows import onset_of
 from mjx_study.results.variables import DERIVED, DESCENTS, LANDSCAPES
-from mjx_study.table import plural
+from mjx_study.table import number, plural
 
 MOST_COST_RATIO: Final = 1e7
 """Maximum ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""
 MOST_SLOPE_RATIO: Final = 10
 """Maximum ratio of the slopes shown to the steepest of the mean cost."""
+MOST_UNRESOLVED: Final = 0.5
+"""Share of the points of a curve whose intervals contain 0 from which on it does not set the limits of an axis."""
+ROOM_AT_ZERO: Final = 0.05
+"""Room beyond zero on an axis of slopes, as a share of the rest."""
 MIDDLE_AND_ENDS: Final = (0.5, 0, 1)
 """Quantiles of the seeds that a descent shows."""
 
@@ -103,7 +107,7 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
     """Plot cost and mean cost along the line above, estimators' slopes below; one column for each of a few models."""
     models, title = a_few(part), f"{title} at each point (95 % intervals)"
     figure, grid = make_panels(2, len(models), 1.6 + 2.9 * len(models), 6.2, title, sharex=True, sharey="row")
-    slopes, steepest = [], 0.0
+    slopes, unresolved, steepest = [], [], 0.0
     direction = json.loads(part.attrs["config"])["direction"] or "random"
     per, unit = line_of(part)
     along = (f"t in theta + t d (d: {direction})" if per == "t" else per) + (f" [{unit}]" if unit else "")
@@ -120,17 +124,27 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
             name, colour, marker = style_of("fobg", onset_of(part))
             first = {"color": colour, "marker": marker}
             below.plot(t, one["exact_first"], **first, **above_all, label=f"mean of {name}, quadrature")
+        told = []
         for mine, style in estimators(one):
-            slopes.append(mine["slope"].values)
+            slope, low, high = _interval(mine["slope"], mine["slope_se"])
+            if np.mean((low < 0) & (high > 0)) > MOST_UNRESOLVED:
+                unresolved.append(slope)
+                told.append(f"{style['label']} not resolved (± {number(float(np.median(high - low)) / 2, 2)})")
+            else:
+                slopes.append(slope)
             style["label"] = f"mean of {style['label']}"
-            line_with_band(below, t, *_interval(mine["slope"], mine["slope_se"]), **style)
+            line_with_band(below, t, slope, low, high, **style)
+        if told:
+            below.text(0.02, 0.97, "\n".join(told), transform=below.transAxes, va="top", fontsize="small")
         above.set_title(model_title(one, ",\n"), fontsize="medium")
         below.axhline(0, color="0.7", linewidth=0.8)
         below.set_xlabel(along)
-    low, high = robust_limits(slopes)  # slopes far beyond that of the mean cost leave the axes
+    low, high = robust_limits(
+        [np.zeros(1), *(slopes or unresolved)]
+    )  # slopes far beyond that of the mean cost leave the axes
     if steepest > 0:
         low, high = max(low, -MOST_SLOPE_RATIO * steepest), min(high, MOST_SLOPE_RATIO * steepest)
-    grid[1, 0].set_ylim(low, high)
+    grid[1, 0].set_ylim(min(low, -ROOM_AT_ZERO * high), max(high, -ROOM_AT_ZERO * low))
     grid[0, 0].set_ylabel("cost")
     grid[1, 0].set_ylabel(f"derivative of the\nmean cost w.r.t. {per}")
     return figure

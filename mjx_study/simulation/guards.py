@@ -19,7 +19,8 @@ from mjx_study.simulation.corners import CONVEX, PLANE, Corners, corner_pairs, c
 from mjx_study.simulation.patches import AT_FIRST_TOUCH, DAMPER, SPRING, Place, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
-_EDGED: Final = (*CONVEX, int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+_CYLINDER: Final = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+_EDGED: Final = (*CONVEX, _CYLINDER, int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
 class Guards(NamedTuple):
@@ -99,7 +100,8 @@ class Points(NamedTuple):
 
     Attributes:
         place: where each contact's point is [m].
-        reach: how far it can move in a step with the bodies [m], with a factor of two to spare.
+        reach: how far it can move in a step with the bodies [m], with a factor of two to spare; MJX's search for the
+            contact of a cylinder may end anywhere within the penetration.
         geom: the two geoms of each contact.
     """
 
@@ -156,7 +158,9 @@ def contact_points(model: mjx.Model, data: mjx.Data) -> Points | None:
     speed = jnp.linalg.norm(moving + jnp.cross(turning, arm), axis=-1).max(axis=-1)
     size = jnp.asarray(model.geom_rbound)[contact.geom]
     rolling = jnp.linalg.norm(turning, axis=-1).max(axis=-1) * jnp.where(size > 0, size, jnp.inf).min(axis=-1)
-    return Points(contact.pos, 2 * model.opt.timestep * (speed + rolling), contact.geom)
+    round_edged = jnp.any(jnp.asarray(np.asarray(model.geom_type) == _CYLINDER)[contact.geom], axis=-1)
+    depth = jnp.where(round_edged, jnp.maximum(-contact.dist, 0.0), 0.0)
+    return Points(contact.pos, 2 * model.opt.timestep * (speed + rolling) + depth, contact.geom)
 
 
 def without(data: mjx.Data, members: Rows) -> mjx.Data:

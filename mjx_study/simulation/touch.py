@@ -16,6 +16,8 @@ from mjx_study.simulation.integration import integrate_position
 
 TOUCHING_SHARE: Final = 1e-6
 """Share of a cell: a body closer than this before the step was already touching, so there is no onset."""
+SPARE: Final = 2.0
+"""Depth, in travels of a step, up to which a contact may appear or vanish by motion: a guard moves along a curve."""
 NEAR_TOUCH: Final = 0.1
 """Share of the way from the touch to the state in contact at which the contact's geometry is evaluated."""
 LEAST: Final = 8
@@ -193,7 +195,7 @@ def changes(here: Course, past: Past, timestep: float | Scalar) -> tuple[Past, C
     flags = crossing.begins, crossing.ends, happens, ends, ends ^ past.touched
     kinds = sum(flag.astype(jnp.int8) * jnp.int8(kind) for flag, kind in zip(flags, _KINDS.values(), strict=True))
     events = past.events + jnp.sum(happens, dtype=jnp.int32)
-    replaced = jnp.where(started, replaced_points(here, past.course, crossing), 0).astype(jnp.int32)
+    replaced = jnp.where(started, replaced_points(here, past.course, timestep), 0).astype(jnp.int32)
     following = Past(here, before, past.steps + 1, events, past.replaced + replaced)
     return following, Changes(crossing.since, jnp.asarray(kinds, jnp.int8), past.events, events)
 
@@ -258,23 +260,24 @@ def crossings(here: Course, preceding: Course, timestep: float | Scalar) -> Cros
     return Crossings(begins, ends, jnp.where(begins, begun, 1 + preceding.room / jnp.where(ends, leaves, 1.0)))
 
 
-def replaced_points(here: Course, preceding: Course, crossing: Crossings) -> Int[Array, ""]:
-    """Number of contact points that appear, or that vanish under force, in a step where no guard passes zero.
+def replaced_points(here: Course, preceding: Course, timestep: float | Scalar) -> Int[Array, ""]:
+    """Number of contact points that appear, or that vanish under force, deeper than the bodies' motion explains.
 
     Args:
         here, preceding: what the guards do in the step, and did in the one before.
-        crossing: the crossings between them.
     """
     points, others = here.points, preceding.points
     if points is None or others is None:
         return jnp.zeros((), int)
-    flags = here.distance < 0, preceding.distance < 0, preceding.pushes, crossing.begins, crossing.ends
-    touching, touched, pushed, begins, ends = (each[-len(points.reach) :] for each in flags)
+    deep = here.distance < -SPARE * timestep * jnp.abs(here.speed)
+    deep_before = preceding.pushes & (preceding.room < -SPARE * timestep * jnp.abs(preceding.leaving))
+    flags = here.distance < 0, preceding.distance < 0, deep, deep_before
+    touching, touched, deep, deep_before = (each[-len(points.reach) :] for each in flags)
     same = jnp.all(points.geom[:, None] == others.geom[None], axis=-1) & touching[:, None] & touched[None]
     moved = jnp.linalg.norm(points.place[:, None] - others.place[None], axis=-1)
     near = same & (moved <= jnp.maximum(points.reach[:, None], others.reach[None]))
-    appear = touching & ~begins & ~jnp.any(near, axis=1)
-    vanish = touched & pushed & ~ends & ~jnp.any(near, axis=0)
+    appear = touching & deep & ~jnp.any(near, axis=1)
+    vanish = touched & deep_before & ~jnp.any(near, axis=0)
     return jnp.sum(appear) + jnp.sum(vanish)
 
 
