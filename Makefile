@@ -55,8 +55,8 @@ coverage: $(STAMP) ## Measure the tables of docs/coverage.md (a few minutes)
 
 engines: $(STAMP) ## Measure what docs/engines.md lacks, in pinned environments (hours; resumable; QUICK=1: a scene, in minutes)
 	-$(BIN)/python -m experiments.engines.install
-	$(BIN)/python -m experiments.engines $(if $(QUICK),--quick)
-	$(if $(QUICK),,$(BIN)/python -m experiments.engines page && $(BIN)/python -m experiments.engines.figure)
+	$(BIN)/python -m experiments.engines $(if $(QUICK),--quick); failed=$$?; $(if $(QUICK),,\
+		$(BIN)/python -m experiments.engines page && $(BIN)/python -m experiments.engines.figure && )exit $$failed
 
 test: $(STAMP) ## Run the tests except slow ones (PYTEST_ARGS='-k name' replaces the two workers)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

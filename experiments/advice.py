@@ -61,7 +61,7 @@ FINE: Final = ("cart", "balls")
 HORIZON: Final = 80
 SAMPLES: Final = 300
 """Samples per batch of a diagnosis."""
-TOTAL: Final = 2000
+TOTAL: Final = 20_000
 """Samples per estimator in the independent measurement."""
 SIZES: Final = (20, 200)
 """Smallest and largest batch size in the independent measurement."""
@@ -149,9 +149,9 @@ def factors(
         spread = np.sum(np.var(each, axis=0, ddof=1))
         bias, _ = squared_bias_of_means(jnp.asarray(each), truth)
         found[name] = float(error(float(bias), spread, name))
-        again = each[picked]
-        gaps = np.sum((again.mean(axis=1) - gradients) ** 2, axis=1)
-        spreads = np.sum(np.var(again, axis=1, ddof=1), axis=1)
+        again = [(np.mean(each[draw], axis=0), np.sum(np.var(each[draw], axis=0, ddof=1))) for draw in picked]
+        gaps = np.sum((np.array([mean for mean, _ in again]) - gradients) ** 2, axis=1)
+        spreads = np.array([variance for _, variance in again])
         gaps -= 2 * (np.trace(noise) + spread / count)
         drawn[name] = error(gaps, spreads, name)
         squares = [float(bias), *np.quantile(gaps, (0.025, 0.975))]

@@ -2,6 +2,7 @@
 
     python -m experiments.learning tune walk zobg >> learning.jsonl                   # the grid, 3 seeds of each pair
     python -m experiments.learning learn walk zobg learning.jsonl >> learning.jsonl   # its best pair, 12 new seeds
+    python -m experiments.learning spread hopper fobg_law                             # its samples at the start
     python -m experiments.learning ppo walk ppo 1e-3 0 >> learning.jsonl              # pip install stable-baselines3
     python -m experiments.learning report learning.jsonl                              # its tables and figure
 
@@ -30,7 +31,8 @@ from matplotlib.ticker import NullLocator
 from scipy import stats
 
 import mjx_study
-from estimators import Differentiation, Estimator, Evaluation, make_estimator, noise
+from estimators import Differentiation, Estimator, Evaluation, GradientEstimate, make_estimator, noise
+from estimators.interpolation import apply_choice, constrained_alpha
 from estimators.sampling import draw
 from experiments import DOCS
 from experiments.figures.rollouts import INK
@@ -47,6 +49,7 @@ METHODS: Final[dict[str, Estimator]] = {
     "fobg": make_estimator("fobg"),
     "fobg_onset": make_estimator("fobg_onset"),
     "ivw": make_estimator("ivw", baseline="leave_one_out"),
+    "aobg": make_estimator("aobg", baseline="leave_one_out"),
     "ivw_onset": make_estimator("aobg_onset", baseline="leave_one_out"),
     "fobg_law": make_estimator("fobg"),
 }
@@ -65,6 +68,9 @@ PIECES: Final = {"walk": 8, "hopper": 4}
 """Pieces of a rollout."""
 WINDOWS: Final[dict[str, tuple[int, ...]]] = {"walk": (2, 4, 8), "hopper": (4,)}
 """Pieces between cuts of the adjoint."""
+GAMMAS: Final[dict[str, tuple[float, ...]]] = {"walk": (100.0, 200.0, 400.0), "hopper": (40.0, 80.0, 160.0)}
+"""AoBG's bounds: about half, once and twice the radius of the zeroth-order mean at the start."""
+FOOT: Final = {"walk": "front_left_foot", "hopper": "foot"}
 TITLES: Final = {"walk": "quadruped", "hopper": "hopper"}
 SEEDS: Final = 3
 """Descents of each pair of the grid."""
@@ -155,18 +161,26 @@ OPTIMIZER: Final = optax.chain(optax.clip_by_global_norm(MOST_NORM), optax.scale
 
 def law_contact(task: Task) -> ContactModel:
     """The contact of `LAW` as stiff as MuJoCo's default, solref = (0.02, 1) and dmax = 0.95, is under a foot."""
-    mass = effective_mass(task.scene, "floor", "foot")
+    mass = effective_mass(task.scene, "floor", FOOT[task.name])
     return family_model(LAW, task.scene, stiffness=mass / (0.95 * 0.02) ** 2, effective_mass=mass)
 
 
+def _contact(task: Task, method: str) -> ContactModel | None:
+    return law_contact(task) if method == "fobg_law" else None
+
+
 def iteration(task: Task, method: str):
-    """One iteration of all descents, as a function of (theta, optimiser's state, learning rate, window, key)."""
-    estimator, contact = METHODS[method], law_contact(task) if method == "fobg_law" else None
+    """One iteration of all descents, as a function of (theta, optimiser's state, learning rate, second setting, key).
+
+    The second setting is AoBG's bound or, for other methods, the window.
+    """
+    estimator, contact = METHODS[method], _contact(task, method)
     rollouts = 1 if len(estimator.needs) == 1 and estimator.needs[0] != "pair" else 2
 
-    def one(theta, state, rate, window, key):
+    def one(theta, state, rate, second, key):
+        window = PIECES[task.name] if method == "aobg" else second
         batches = draw(estimator.needs, Pieces(task, window, contact), theta, key, SAMPLES // rollouts)
-        estimate = estimator(batches)
+        estimate = bounded(batches, second) if method == "aobg" else estimator(batches)
         usable = jnp.all(jnp.isfinite(estimate.mean))
         updates, following = OPTIMIZER.update(jnp.where(usable, estimate.mean, 0.0), state, theta)
         first = jax.tree.leaves(batches[estimator.needs[0]])[0]
@@ -176,21 +190,31 @@ def iteration(task: Task, method: str):
     return jax.jit(jax.vmap(one))
 
 
-def descend(task: Task, method: str, settings: list[tuple[float, int, int]], iterations: int = ITERATIONS):
-    """Run descents with (learning rate, window, seed) each, together; return thetas, and curves with their seconds."""
+def bounded(batches: Any, gamma: Any) -> GradientEstimate:
+    """AoBG with a bound that is a value of the program, so that one program serves the grid."""
+    estimator: Any = METHODS["aobg"]
+    parts = estimator.parts(*estimator.pick(batches))
+    choice = estimator.choose(*parts)
+    variances = choice.variance_zeroth, choice.variance_first
+    alpha = constrained_alpha(*variances, choice.discrepancy, choice.epsilon, gamma)
+    return apply_choice(dataclasses.replace(choice, alpha=alpha), *parts)
+
+
+def descend(task: Task, method: str, settings: list[tuple[float, float, int]], iterations: int = ITERATIONS):
+    """Run descents with (learning rate, second setting, seed) each, together; return thetas, and curves."""
     count = len(settings)
-    rates, windows, seeds = (jnp.array(column) for column in zip(*settings, strict=True))
+    rates, settled, seeds = (jnp.array(column) for column in zip(*settings, strict=True))
     keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(7), seed))(seeds)
     theta = jnp.broadcast_to(task.theta, (count, task.theta.size))
     state = jax.vmap(OPTIMIZER.init)(theta)
     step = iteration(task, method)
     fold = jax.jit(jax.vmap(jax.random.fold_in, (0, None)))
     began = time.perf_counter()
-    jax.block_until_ready(step(theta, state, rates, windows, fold(keys, 0)))
+    jax.block_until_ready(step(theta, state, rates, settled, fold(keys, 0)))
     built, records, seconds = time.perf_counter() - began, [], []
     began = time.perf_counter()
     for index in range(iterations):
-        theta, state, record = step(theta, state, rates, windows, fold(keys, index))
+        theta, state, record = step(theta, state, rates, settled, fold(keys, index))
         records.append(jax.device_get(record))
         seconds.append(time.perf_counter() - began)
     costs, alphas, usable, nonfinite = (np.array(column).T for column in zip(*records, strict=True))
@@ -248,8 +272,10 @@ def executed(task: Task, thetas: Float[np.ndarray, "policies params"]) -> dict[s
     return found
 
 
-def grid(name: str, method: str) -> list[tuple[float, int]]:
-    """Learning rates and windows to choose from, nine pairs for every method."""
+def grid(name: str, method: str) -> list[tuple[float, float]]:
+    """Learning rates and windows, or bounds of AoBG, to choose from, nine pairs for every method."""
+    if method == "aobg":
+        return list(product(RATES if name == "walk" else (1.5e-3, 2.6e-3, 4.5e-3), GAMMAS[name]))
     if method == "zobg" or len(WINDOWS[name]) == 1:
         return [(float(rate), PIECES[name]) for rate in np.geomspace(RATES[0] / 4, 4 * RATES[-1], 9)]
     return list(product(RATES, WINDOWS[name]))
@@ -265,13 +291,28 @@ def tune(name: str, method: str, iterations: int = ITERATIONS) -> dict[str, Any]
     return {"pairs": pairs, "final": final, **kept}
 
 
-def learn(name: str, method: str, rate: float, window: int) -> dict[str, Any]:
-    """Descents of new seeds with a learning rate and a window."""
+def learn(name: str, method: str, rate: float, window: float) -> dict[str, Any]:
+    """Descents of new seeds with a learning rate and a window, or AoBG's bound."""
     task = make(name)
     settings = [(rate, window, 100 + seed) for seed in range(LEARN_SEEDS)]
     thetas, found = descend(task, method, settings)
     kept = {name: each for name, each in found.items() if name != "alpha"} | {"alpha": np.nanmean(found["alpha"])}
     return {"rate": rate, "window": window, "final": final_costs(task, thetas), **kept, **executed(task, thetas)}
+
+
+def spread(name: str, method: str) -> dict[str, Any]:
+    """First-order samples at the start: quantiles of their norms, and the cosines of the means of batches with the mean
+    of all but the largest hundredth."""
+    task, batches = make(name), 16
+    objective = Pieces(task, PIECES[task.name], _contact(task, method))
+    program = jax.jit(lambda keys: objective.differentiate(task.theta, keys).gradient)
+    keys = jax.random.split(jax.random.key(0), (batches, SAMPLES))
+    samples = np.stack([program(each) for each in keys])
+    norms = np.linalg.norm(samples, axis=-1)
+    usual = samples[norms < np.quantile(norms, 0.99)].mean(axis=0)
+    means = samples.mean(axis=1)
+    cosines = means @ usual / (np.linalg.norm(means, axis=1) * np.linalg.norm(usual))
+    return {"quantiles": np.quantile(norms, (0.5, 0.99, 1)), "cosines": cosines}
 
 
 def proximal(name: str, rate: float, seed: int) -> dict[str, Any]:
@@ -335,7 +376,8 @@ def figure(lines: list[dict[str, Any]]) -> Figure:
 
 def _new_seeds(lines: list[dict[str, Any]], name: str, method: str) -> list[dict[str, Any]]:
     """The lines of seeds that no learning rate was chosen by."""
-    found = [each for each in lines if (each["task"], each["method"]) == (name, method) and each["what"] != "tune"]
+    found = [each for each in lines if (each["task"], each["method"]) == (name, method) and "final" in each]
+    found = [each for each in found if each["what"] != "tune"]
     return [each for each in found if each.get("seed", 100) >= 100]
 
 
@@ -346,8 +388,9 @@ def table(lines: list[dict[str, Any]], name: str) -> str:
     for method in [*METHODS, "ppo"]:
         if seeds := _new_seeds(lines, name, method):
             numbers = [np.concatenate([np.ravel(each[column]) for each in seeds]) for column in columns]
-            window = f", {each:g}/{PIECES[name]}" if (each := seeds[0].get("window")) and method != "zobg" else ""
-            chosen = f"{seeds[0]['rate']:.2g}{window}"
+            window = seeds[0].get("window")
+            second = _second(name, method).format(window) if window and method != "zobg" else ""
+            chosen = f"{seeds[0]['rate']:.2g}{second}"
             rows.append((f"`{method}`" if method != "ppo" else "PPO", chosen, *map(_with_interval, numbers)))
     return markdown_table(rows, HEADINGS)
 
@@ -358,13 +401,18 @@ def grid_table(lines: list[dict[str, Any]], name: str) -> str:
     for line in lines:
         if (line["what"], line["task"]) == ("tune", name):
             windows = {window for _, window in line["pairs"]}
-            share = f", {{:g}}/{PIECES[name]}" if len(windows) > 1 else ""
+            second = _second(name, line["method"]) if len(windows) > 1 else ""
             cells = [
-                f"{number(float(np.mean(final)))} ({rate:.2g}{share.format(window)})"
+                f"{number(float(np.mean(final)))} ({rate:.2g}{second.format(window)})"
                 for (rate, window), final in zip(line["pairs"], line["final"], strict=True)
             ]
             rows.append((f"`{line['method']}`", *cells))
     return markdown_table(sorted(rows), ["method", *map(str, range(1, 10))])
+
+
+def _second(name: str, method: str) -> str:
+    """Format of a window as a share of the rollout, or of AoBG's bound."""
+    return ", gamma {:g}" if method == "aobg" else f", {{:g}}/{PIECES[name]}"
 
 
 def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:
@@ -387,7 +435,7 @@ def main(what: str, name: str, method: str, *arguments: str) -> None:
         lines = [json.loads(line) for line in Path(arguments[0]).read_text().splitlines()]
         found = learn(name, method, *best(lines, name, method))
     else:
-        found = {"tune": tune, "ppo": lambda name, method, *rest: proximal(name, *rest)}[what](
+        found = {"tune": tune, "spread": spread, "ppo": lambda name, method, *rest: proximal(name, *rest)}[what](
             name, method, *map(json.loads, arguments)
         )
     line = {"what": what, "task": name, "method": method, **found}

@@ -26,8 +26,8 @@ def replace_tables(text: str, tables: Mapping[str, str]) -> str:
         ValueError: the page does not have exactly one table of a name.
     """
     for name, table in tables.items():
-        block = rf"(<!-- table: {re.escape(name)} -->\n).*?(\n<!-- end -->)"
-        text, found = re.subn(block, lambda match, table=table: f"{match[1]}{table}{match[2]}", text, flags=re.DOTALL)
+        block = rf"(<!-- table: {re.escape(name)} -->\n)(?:(?!<!--).)*(<!-- end -->)"
+        text, found = re.subn(block, lambda match, table=table: f"{match[1]}{table}\n{match[2]}", text, flags=re.DOTALL)
         if found != 1:
             raise ValueError(f"the page must have one table {name}, it has {found}")
     return text

@@ -1,6 +1,7 @@
 """Tables of docs/robots.md: robots by native code, through XLA, by stock MJX and by the C engine, on this machine.
 
     python -m experiments.robots ROBOT ...    # all of `ROBOTS` without names; each route in a process of its own
+    python -m experiments.robots quadruped --routes native stock --samples 256 --precision float32
     python -m experiments.robots --page       # only the page
 
 Each route rolls out `STEPS` steps from states in contact, under the control that holds them there, solved to rounding
@@ -35,7 +36,7 @@ from mjx_study.bench import gradient_of_engine
 from mjx_study.graph.function import ScalarFunction
 from mjx_study.graph.linear_map import implicit_derivative
 from mjx_study.graph.scalars import captured_once
-from mjx_study.runtime import available_cores
+from mjx_study.runtime import PRECISIONS, available_cores
 from mjx_study.simulation import native_step
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.linear_algebra import solve_positive_definite
@@ -78,11 +79,11 @@ def standing(host: mujoco.MjModel) -> np.ndarray:
     return host.key_ctrl[0] if host.nkey else np.zeros(host.nu)
 
 
-def measure(name: str, route: str) -> None:
+def measure(name: str, route: str, samples: int | None, precision: str) -> None:
     """Print, after each kind of program, million steps per second and seconds to the first result of all so far."""
-    mjx_study.configure()
+    mjx_study.configure(precision=precision)
     host, platform = loaded(ROBOTS[name]), jax.default_backend()
-    size, found = SAMPLES[platform], dict[str, Any]()
+    size, found = samples or SAMPLES[platform], dict[str, Any]()
     step = mjx.step if route == "stock" else mjx_study.step
     for kind in ("rollouts", "gradients"):
         begun, gradient = time.perf_counter(), kind == "gradients"
@@ -97,7 +98,8 @@ def measure(name: str, route: str) -> None:
         best = min(interleaved({kind: call}, REPEATS)[kind])
         together = available_cores() if route == "engine" and gradient else size
         found[kind] = {"rate": together * STEPS / best / 1e6, "built": built, "bytes": memory}
-        print(json.dumps({"platform": platform, "samples": size, "found": found}), flush=True)
+        setting = {"platform": platform, "samples": size, "precision": precision}
+        print(json.dumps({**setting, "found": found}), flush=True)
 
 
 def by_engine(host: mujoco.MjModel, batch: int) -> partial[Any]:
@@ -155,22 +157,32 @@ def main() -> None:
     parser.add_argument("robots", nargs="*", default=ROBOTS)
     parser.add_argument("--page", action="store_true", help="only write the page")
     parser.add_argument("--routes", nargs="+", default=ROUTES, choices=ROUTES)
+    parser.add_argument("--samples", type=int, help="rollouts at once, in place of the tables'")
+    parser.add_argument("--precision", default="float64", choices=PRECISIONS)
     parser.add_argument("--here", action="store_true", help="measure one robot by one route in this process")
     parser.add_argument("--into", default=RESULTS, help="file of results")
     given = parser.parse_args()
     if given.here:
-        measure(given.robots[0], given.routes[0])
+        measure(given.robots[0], given.routes[0], given.samples, given.precision)
         return
+    settings = ("--precision", given.precision, *(("--samples", str(given.samples)) if given.samples else ()))
     for name, route in itertools.product(() if given.page else given.robots, given.routes):
-        command = "experiments.robots", name, "--routes", route, "--here"
+        command = "experiments.robots", name, "--routes", route, "--here", *settings
         keep({"robot": name, "route": route}, command, "1" if route == "native" else "xla", MOST_SECONDS, given.into)
     if given.into == RESULTS:
         write_page()
 
 
+def results() -> dict[tuple[Any, ...], dict[str, Any]]:
+    """The last measurement of each platform, robot, route, number of samples and precision."""
+    names, rows = ("platform", "robot", "route", "samples"), map(json.loads, open(RESULTS))
+    return {(*(row[name] for name in names), row.get("precision", "float64")): row["found"] for row in rows}
+
+
 def write_page() -> None:
     """Write the tables of docs/robots.md, from the last measurement of each robot, route and platform."""
-    rows = {(each["platform"], each["robot"], each["route"]): each["found"] for each in map(json.loads, open(RESULTS))}
+    every = results()
+    rows = {key[:3]: found for key, found in every.items() if key[3:] == (SAMPLES[key[0]], "float64")}
     header = [f"{what}: {kind}" for what, kind in (*COLUMNS.values(), ("building [s]", "native"))]
     tables = dict[str, str]()
     for platform in sorted({platform for platform, *_ in rows}):
@@ -188,6 +200,13 @@ def write_page() -> None:
         found = [rows.get(("cpu", name, route), {}).get("gradients", {}) for route in ("native", "xla", "stock")]
         lines.append([f"`{name}`", *(number(each.get("bytes", math.nan) / 1e3) for each in found)])
     tables["memory"] = markdown_table(lines, ["robot", "native", "through XLA", "stock MJX, one iteration"])
+    lines = []
+    for samples, precision in sorted({key[3:] for key in every if key[:2] == ("gpu", "quadruped")}):
+        found = [every.get(("gpu", "quadruped", route, samples, precision), {}) for route in ("native", "stock")]
+        rates = [each.get(kind, {}).get("rate", math.nan) for each in found for kind in ("rollouts", "gradients")]
+        lines.append([f"{samples:,}", precision, *map(number, rates)])
+    columns = [": ".join(COLUMNS[route, kind]) for route in ("native", "stock") for kind in ("rollouts", "gradients")]
+    tables["batches"] = markdown_table(lines, ["samples", "precision", *columns])
     found = {name: sizes(name) for name in ROBOTS}
     lines = [[f"`{name}`", *(f"{size:,}" for size in each.values())] for name, each in found.items()]
     write_tables(DOCS / "robots.md", tables | {"size": markdown_table(lines, ["robot", *found["quadruped"]])})

@@ -2,13 +2,12 @@
 
     python -m experiments.work
 
-Operations are those of the statements, in loops as often as `SAMPLES` states in contact run them. Loads and stores are
+Operations are those of the statements, in loops as often as `STATES` states in contact run them. Loads and stores are
 those that the best allocation of an H100's registers leaves, of the statements in their order: a value is put into
 memory if others that are used sooner need its register, and is read again when it is used.
 """
 
 import heapq
-import json
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -22,7 +21,7 @@ from experiments import DOCS
 from experiments.drop_in import start_states
 from experiments.native import number
 from experiments.pages import write_tables
-from experiments.robots import RESULTS, ROBOTS, loaded, solved_step, standing
+from experiments.robots import ROBOTS, SAMPLES, loaded, results, solved_step, standing
 from mjx_study.graph import numpy_code
 from mjx_study.graph.c import Writer
 from mjx_study.graph.native import SWITCH
@@ -30,7 +29,7 @@ from mjx_study.graph.parts import Loop, Statement
 from mjx_study.simulation._mjx import mjx
 from mjx_study.table import markdown_table
 
-SAMPLES: Final = 256
+STATES: Final = 256
 REGISTERS: Final = 255 // 2
 """Of 64 bits, that a thread of an H100 has."""
 OPERATIONS: Final = 34e12 / 2
@@ -54,12 +53,12 @@ def passes_of(name: str) -> dict[str, float]:
     numpy_code._looped = counted
     host = loaded(ROBOTS[name])
     model, data = mjx.put_model(host), mjx.make_data(host)
-    qpos, qvel = start_states(host, SAMPLES)
+    qpos, qvel = start_states(host, STATES)
     data = data.replace(ctrl=standing(host))
     advance = lambda qpos, qvel: mjx_study.step(model, data.replace(qpos=qpos, qvel=qvel)).qvel  # noqa: E731
     jax.block_until_ready(jax.jit(jax.vmap(advance))(qpos, qvel))
     assert found
-    return {each: count / SAMPLES for each, count in found.items()}
+    return {each: count / STATES for each, count in found.items()}
 
 
 def in_order(items: Iterable[Statement | Loop], passes: dict[str, float]) -> Iterator[tuple[Any, float]]:
@@ -139,11 +138,9 @@ def work(name: str) -> tuple[float, float]:
 def main() -> None:
     """Write the table."""
     mjx_study.configure()
-    rows = [json.loads(line) for line in open(RESULTS)]
-    lines = []
+    found, lines = results(), []
     for name in ROBOTS:
-        found = [each for each in rows if (each["platform"], each["robot"], each["route"]) == ("gpu", name, "native")]
-        rate = 1e6 * found[-1]["found"]["rollouts"]["rate"]
+        rate = 1e6 * found["gpu", name, "native", SAMPLES["gpu"], "float64"]["rollouts"]["rate"]
         operations, memory = work(name)
         shares = f"{rate * operations / OPERATIONS:.0%}", f"{rate * memory / BANDWIDTH:.0%}"
         lines.append([f"`{name}`", number(rate / 1e6), f"{operations:,.0f}", f"{memory / 1e3:,.0f}", *shares])

@@ -79,7 +79,8 @@ def test_the_page_says_what_the_data_give() -> None:
     text, found = PAGE.read_text(), cells(CELLS)
     assert replace_tables(text, tables(found, cells(CHECKS))) == text
     every = list(itertools.product(catalog.ENGINES, SCENES, TIMESTEPS))
-    assert f"Of {len(every)} cells, {sum(key not in found for key in every)} are [not measured]" in text
+    lacking = sum("slope" not in found.get(key, {}) for key in every)
+    assert f"Of {len(every)} cells, {lacking} have [no numbers]" in text
 
 
 def test_times_and_versions_are_those_of_the_cells() -> None:
@@ -155,6 +156,33 @@ def test_the_rigid_limit_is_a_flight_that_reverses(name: str) -> None:
             distance += speed * step
             speed = -scene.restitution * speed if distance < 0 > speed else speed
         assert abs(edge + way * distance - scene.exact(theta)) < 1e-4
+
+
+ENGINE = """#!/bin/sh
+echo $4 >> {0}
+case $4 in toss) exec sleep 60;; wall) echo '{{"engine": "mjx", "scene": "wall", "timestep": 0.005, "error": ""}}';;
+*) exit 1; esac
+"""
+
+
+def test_a_cell_beyond_the_limit_has_this_as_its_reason_and_waits_for_a_higher_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    python, asked, data = (tmp_path / name for name in ("python", "asked", "data"))
+    python.write_text(ENGINE.format(asked))
+    python.chmod(0o755)
+    monkeypatch.setattr(command, "interpreter", lambda engine: python)
+    words = ["--only", "mjx", "--timestep", "0.005", "--into", str(data), "--scene", "toss", "wall", "push"]
+    for limit, again in (("0.5", "toss wall push"), ("0.5", "push"), ("0.6", "toss push")):
+        asked.write_text("")
+        monkeypatch.setattr(sys, "argv", ["engines", *words, "--limit", limit])
+        monkeypatch.setattr(command, "CELLS", tmp_path / "none")
+        with pytest.raises(SystemExit) as ended:
+            command.main()
+        assert ended.value.code == 1 and asked.read_text().split() == again.split()
+    found = cells(data)
+    assert set(found) == {("mjx", scene, 0.005) for scene in ("toss", "wall")}
+    assert "| toss at 5 ms | no result within 0.01 minutes |" in tables(found, {})["reasons"]
 
 
 def test_cells_of_other_files_are_added_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

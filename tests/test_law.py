@@ -239,6 +239,11 @@ def test_bench_leaves_out_rivals_of_another_law() -> None:
     assert any("left out" in line for line in report.lines())
 
 
+DROP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="1 1 .1" condim="1"/>
+  <body><joint type="slide" axis="0 0 1"/><geom name="ball" size=".1" mass="1" condim="1"/></body></worldbody>
+  <keyframe><key qpos="0.11" qvel="-1"/></keyframe></mujoco>"""
+
+
 @pytest.mark.parametrize(
     ("command", "message"),
     [
@@ -247,21 +252,19 @@ def test_bench_leaves_out_rivals_of_another_law() -> None:
         ("rollout pusher --contact mujoco --smoothing 1e-5", "--smoothing has no effect on MuJoCo's law"),
         ("sweep pusher --contact conic --onset linear --dry-run", "--onset is for MuJoCo's law"),
         ("sweep pusher --contact mujoco,conic --estimators fobg_onset --dry-run", "corrects MuJoCo's law, not conic"),
+        ("compare drop.xml --contact hunt_crossley", "contact_pair, as mjx-study init writes for an MJCF"),
+        ("gradcheck drop.xml --contact hunt_crossley", "--stiffness must be given in N/m, along with --pair"),
     ],
 )
-def test_what_is_only_for_mujocos_law_is_refused(
+def test_what_does_not_go_with_a_law_is_refused(
     command: str, message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "drop.xml").write_text(DROP)
     assert cli.main(command.split()) == 2
     printed = capsys.readouterr().err
     said = [line for line in printed.splitlines() if line.startswith("mjx-study: ")]
     assert len(said) == 1 and message in said[0], printed
-
-
-DROP = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="1 1 .1" condim="1"/>
-  <body><joint type="slide" axis="0 0 1"/><geom name="ball" size=".1" mass="1" condim="1"/></body></worldbody>
-  <keyframe><key qpos="0.11" qvel="-1"/></keyframe></mujoco>"""
 
 
 def test_a_law_of_ones_own_is_one_file(
@@ -289,6 +292,19 @@ def test_a_law_of_ones_own_is_one_file(
     task = make_task(str(path), horizon=60).replace(contact_pair=PAIR, sigma=0.1)
     about = StudyConfig(tasks=(task,), contact=("spring",), stiffness=(3000.0,), samples=(50,), estimators=("fobg",))
     assert float(run_study(about)["relative_error"].squeeze()) < 0.1
+
+
+@pytest.mark.parametrize("model", ["momentum_transfer", "drop.xml"])
+def test_a_law_whose_extra_is_missing_says_what_to_install(
+    model: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drop.xml").write_text(DROP)
+    monkeypatch.setitem(sys.modules, "mujodico", None)
+    given = ["--stiffness", "2500", "--pair", "floor,ball"] if model == "drop.xml" else []
+    assert cli.main(["gradcheck", model, "--contact", "kelvin_voigt", *given]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1].startswith("mjx-study: kelvin_voigt needs MuJoDiCo: pip install 'mjx-study[laws]'")
 
 
 def test_forces_and_onsets_of_mujocos_law_are_refused() -> None:

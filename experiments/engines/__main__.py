@@ -1,8 +1,9 @@
 """Measure the missing cells of engines that are installed, each in a process of its own, or write the page.
 
 python -m experiments.engines [--only ENGINE ...] [--scene SCENE ...] [--timestep H] [--quick]: appends to
-data/engines.jsonl a line per cell, so that the same command resumes; --quick has a quarter of the rollouts, at the
-longer timestep, into build/engines/quick.jsonl, which no page is made of. --jobs N measures N cells at a time, each on
+data/engines.jsonl a line per cell, so that the same command resumes; a cell that takes longer than --limit has this as
+its reason, and is measured again only with a higher one. --quick has a quarter of the rollouts, at the longer timestep,
+into build/engines/quick.jsonl, which no page is made of. --jobs N measures N cells at a time, each on
 one core. --here runs all in this interpreter in place of the engines' environments, and --into FILE keeps what is new
 apart: so a machine without a network measures what its PYTHONPATH has, and `merge FILE ...` adds that to the data.
 python -m experiments.engines check: repeats accusing cells under half the noise, and tosses from higher, into
@@ -13,6 +14,7 @@ python -m experiments.engines page: writes the tables of docs/engines.md.
 import argparse
 import itertools
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -30,8 +32,8 @@ from experiments.engines.page import CELLS, CHECKS, PAGE, cells, tables
 from experiments.engines.scenes import SCENES, TIMESTEPS, VARIANTS
 from experiments.pages import write_tables
 
-LIMIT = 900
-"""Seconds that a cell may take."""
+LIMIT: Final = 900.0
+"""Seconds that a cell may take if `--limit` gives no others."""
 ONE_CORE: Final = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
 """Of cells of which several are measured at a time."""
 TRIAL: Final = ("toss",)
@@ -49,6 +51,7 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
     target.parent.mkdir(parents=True, exist_ok=True)
     apart = arguments.quick or arguments.what == "check"
     found = {**({} if apart else cells(CELLS)), **cells(target)}
+    done = {key for key, cell in found.items() if cell.get("limit", math.inf) >= arguments.limit}
     todo = []
     for name in arguments.only or ENGINES:
         python = Path(sys.executable) if arguments.here else interpreter(ENGINES[name])
@@ -58,7 +61,7 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
         steps = arguments.timestep or TIMESTEPS[: 1 if arguments.quick else None]
         scenes = arguments.scene or (TRIAL if arguments.quick else SCENES)
         every = CHECKED if arguments.what == "check" else itertools.product((name,), scenes, steps)
-        todo += [(python, *key[:2], str(key[2])) for key in every if key[0] == name and key not in found]
+        todo += [(python, *key[:2], str(key[2])) for key in every if key[0] == name and key not in done]
     writing, cores = Lock(), SimpleQueue()
     pin = arguments.jobs > 1 and shutil.which("taskset") is not None
     for core in itertools.islice(itertools.cycle(sorted(os.sched_getaffinity(0)) if pin else [0]), arguments.jobs):
@@ -71,19 +74,24 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
         how = ["quick"] * arguments.quick
         command = [*pinned, python, "-m", "experiments.engines.worker", *words, *how]
         environment = {**os.environ, **ONE_CORE} if arguments.jobs > 1 else None
-        said, failed, began = "measured", False, time.perf_counter()
+        said, line, began = "measured", {}, time.perf_counter()
         try:
-            done = subprocess.run(
-                command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=True
+            printed = subprocess.run(
+                command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=arguments.limit, check=True
             )
-            line = json.loads(done.stdout.splitlines()[-1]) | {"seconds": time.perf_counter() - began}
+            line = json.loads(printed.stdout.splitlines()[-1]) | {"seconds": time.perf_counter() - began}
+        except subprocess.TimeoutExpired:
+            said = f"no result within {arguments.limit / 60:g} minutes"
+            line = dict(zip(("engine", "scene"), words, strict=False)) | {"timestep": float(words[2])}
+            line |= {"error": said, "limit": arguments.limit}
+        except subprocess.CalledProcessError as error:
+            said = f"FAILED: {error.stderr[-500:]}"
+        if line:
             with writing, target.open("a") as file:
                 file.write(json.dumps(line) + "\n")
-        except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
-            said, failed = f"FAILED: {str(error.stderr or error)[-500:]}", True
         print(*words, said, flush=True)
         cores.put(core)
-        return failed
+        return not line
 
     with ThreadPoolExecutor(arguments.jobs) as pool:
         return sum(pool.map(measure, todo))
@@ -111,6 +119,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=tuple(ENGINES), help="these engines", metavar="ENGINE")
     parser.add_argument("--scene", nargs="+", choices=tuple(SCENES), help="these scenes", metavar="SCENE")
     parser.add_argument("--timestep", nargs="+", type=float, choices=TIMESTEPS, help="[s]")
+    parser.add_argument("--limit", type=float, default=LIMIT, help="seconds that a cell may take, 900 by default")
     parser.add_argument("--jobs", type=int, default=1, help="cells at a time")
     parser.add_argument("--here", action="store_true", help="in this interpreter, not in the engines' environments")
     parser.add_argument("--into", type=Path, help="file in place of the data")

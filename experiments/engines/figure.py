@@ -21,10 +21,10 @@ def main() -> None:
     axes = figure.subplots()
     for i, step in enumerate(TIMESTEPS):
         for row, name in enumerate(names):
-            cell = toss.get((name, "toss", step))
-            ratio = cell["mean"] / cell["slope"] if cell else float("nan")
+            cell = toss.get((name, "toss", step), {})
+            ratio = cell["mean"] / cell["slope"] if "slope" in cell else float("nan")
             at = row + 0.4 * i - 0.2
-            said = verdict(cell) if cell else "not measured"
+            said = verdict(cell) if "slope" in cell else "not measured"
             if -1 < ratio < 12 and said != "no contact":
                 faint = 0.4 if said == "unknown" else 1.0
                 axes.barh(at, ratio, 0.38, color=f"C{i}", alpha=faint, label=f"{1000 * step:g} ms" if not row else None)

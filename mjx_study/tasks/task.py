@@ -177,7 +177,8 @@ class Task:
         """Effective mass of the swept contact along its normal [kg]; a ValueError if the task has none."""
         if self.contact_pair is None:
             raise ValueError(
-                f"{self.name} names no contact whose stiffness could be set (contact_pair); use the contact family mjcf"
+                f"{self.name} names no contact whose stiffness could be set: use the contact family mjcf, or a task "
+                "with a contact_pair, as mjx-study init writes for an MJCF"
             )
         return effective_mass(self.scene, *self.contact_pair)
 
