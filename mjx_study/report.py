@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.study import drawings_of, plot_study
 from mjx_study.results.kind import Drawing, findings_of, kind_of
-from mjx_study.results.numbers import numbers_of, shown
+from mjx_study.results.numbers import meanings_of, numbers_of, shown
 from mjx_study.results.warnings import warnings_of
 from mjx_study.table import plural
 
@@ -50,7 +50,6 @@ class StudyAccessor:
 @np.errstate(over="ignore", invalid="ignore")  # numbers of a motion that explodes
 def render_report(dataset: xr.Dataset) -> str:
     config, kind, drawings = json.loads(dataset.attrs["config"]), kind_of(dataset), drawings_of(dataset)
-    quantities = {name: kind.quantities[name] for name in kind.columns}
     pages = jinja2.Environment(loader=jinja2.PackageLoader("mjx_study"), autoescape=True, keep_trailing_newline=True)
     return pages.get_template("report.html").render(
         tasks=", ".join(config["tasks"]),
@@ -61,7 +60,7 @@ def render_report(dataset: xr.Dataset) -> str:
         figures=[_figure(name, figure, drawings) for name, figure in plot_study(dataset).items()],
         summary=_summary(dataset),
         numbers=numbers_of(dataset),
-        meanings={each.heading: each.description for each in quantities.values()},
+        meanings=meanings_of(dataset),
         config=[[key, shown(value)] for key, value in sorted(config.items()) if value not in (None, [], "")],
         provenance=_provenance(dataset),
         command=dataset.attrs.get("command"),

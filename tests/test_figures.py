@@ -18,6 +18,8 @@ from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import STYLES, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report
 from mjx_study.results.kind import find_kind
+from mjx_study.results.numbers import meanings_of
+from mjx_study.results.numbers import numbers_of as table_of
 from mjx_study.results.variables import CELL, ONSETS
 
 OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
@@ -264,6 +266,18 @@ def test_a_report_shows_what_there_is_and_once() -> None:
     )
     assert 'name="viewport"' in page and "prefers-color-scheme: dark" in page
     assert "<td>gamma</td>" in page and "<td>theta</td>" not in page and "<td>direction</td>" not in page
+
+
+def test_a_table_of_estimates_has_intervals_and_milliseconds_as_compare_has() -> None:
+    numbers = {"variance": 2.0, "variance_lower": 1.25, "variance_upper": 3.0, "seconds_per_sample": 0.0005}
+    for seeds, variance in ((1, "2 (1.2 to 3)"), (3, "2")):
+        found = study("gradients", [("penalty", 10.0)], seeds=seeds, relative_error_se=0.1, **numbers)
+        headings, rows = table_of(found) or ([], [])
+        assert len(rows) == 3
+        for row in rows:
+            shown = dict(zip(headings, row, strict=True))
+            assert shown["variance"] == variance and shown["ms"] == "0.5"
+        assert set(headings) <= meanings_of(found).keys() | {"contact model", "estimator"}
 
 
 def test_any_name_of_a_task_can_be_written() -> None:

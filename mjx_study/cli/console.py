@@ -62,9 +62,7 @@ def columns(confidence: float, onset: str, *, details: bool, scalar: bool) -> li
     quantities = GRADIENTS | COORDINATES | DERIVED
 
     def interval(row: Row) -> str:
-        return (
-            f"{number(row.variance)} ({number(row.variance_lower, 2)} to {number(row.variance_upper, 2)}){_doubt(row)}"
-        )
+        return f"{GRADIENTS['variance'].interval(row.variance, row.variance_lower, row.variance_upper)}{_doubt(row)}"
 
     def effective(row: Row) -> str:
         return number(row.effective_samples, 2) + (f" ({percent(row.top_share)})" if row.effective_samples else "")
@@ -73,7 +71,6 @@ def columns(confidence: float, onset: str, *, details: bool, scalar: bool) -> li
         "stiffness": (f" [{quantities['stiffness'].unit}]", lambda row: number(row.stiffness or None)),
         "variance": (f" ({percent(confidence)} interval)", interval),
         "effective_samples": (f" ({quantities['top_share'].heading})", effective),
-        "seconds_per_sample": ("", lambda row: number(1e3 * row.seconds_per_sample, 2)),
     }
     own |= {name: (f" -> {quantities[DEBIASED[name]].heading}", partial(_debiased, name=name)) for name in DEBIASED}
 
@@ -244,6 +241,9 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         "",
         *format_table([_row(run, onset, costs) for run in document["runs"]], headings),
     ]
+    at_once = min(len(document["runs"]), len(document["environment"]["devices"]))
+    if at_once > 1:
+        lines.append(f"seconds: of wall clock, without compilation, while {at_once} estimators compute side by side.")
     for run in document["runs"]:
         for stop in run["stopped"]:
             label = label_of(run["estimator"], onset)

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import json
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,7 +24,7 @@ from mjx_study.options.parser import UsageError
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.results.kind import findings_of
-from mjx_study.results.numbers import numbers_of
+from mjx_study.results.numbers import meanings_of, numbers_of
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.table import as_plain, digits_to_tell_apart, format_table, size
@@ -145,7 +146,7 @@ def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> 
     sizes = ", ".join(f"{name} {length}" for name, length in dataset.sizes.items() if length > 1)
     titles, rows = numbers_of(dataset) or ([], [])
     findings = findings_of(dataset)
-    lines = [*format_table(rows, titles), ""] if 0 < len(rows) <= MOST_ROWS else []
+    lines = [*format_table(rows, titles), "", *_meanings(dataset, titles)] if 0 < len(rows) <= MOST_ROWS else []
     lines += [*(f"{sentence}." for sentence in findings), f"computed {computed} cells{sizes and f'; {sizes}'}"]
     lines += [f"warning: {message}" for message in warnings_of(dataset) if message not in plan.warnings]
     lines += [f"written to {folder}: results.nc; mjx-study plot {folder} draws it"] if unwritten is None else []
@@ -160,6 +161,13 @@ def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> 
     failed = len(json.loads(dataset.attrs.get("failed_cells", "{}")))
     failure = f"{failed} cells failed; the warnings say why" if failed else None
     return print_report(options, document, lines, unwritten, failure, all_lost(plan, dataset))
+
+
+def _meanings(dataset: xr.Dataset, titles: Iterable[str]) -> list[str]:
+    """What the columns of a table mean."""
+    found = "; ".join(f"{name}: {meaning}" for name, meaning in meanings_of(dataset).items() if name in titles)
+    seeds = ", of several seeds medians" if dataset.sizes.get("seed", 1) > 1 else ""
+    return [*textwrap.wrap(f"{found}. After ±: a standard error; in brackets: a confidence interval{seeds}.", 140), ""]
 
 
 def _sweep_head(plan: StudyPlan, missing: int) -> list[str]:

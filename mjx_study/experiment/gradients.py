@@ -80,7 +80,7 @@ class Gradients(StudyKind):
     variables = GRADIENTS
     optional = (*ONSETS, "gradient", "reference", "reference_pairs")
     columns = ("variance", "effective_samples", "top_share", "relative_error", "debiased_error", "squared_bias")
-    columns = (*columns, "alpha", "nonfinite")
+    columns = (*columns, "alpha", "seconds_per_sample", "nonfinite")
     compared = "variance"
     finite = "gradient_norm"
 

@@ -34,7 +34,7 @@ MEANING: Final = {
     "wrong": "the derivative is not that of the step",
     "engine": "MJX's step is not the C engine's, and nothing documented explains it",
     "value": "the step itself is not that of mjx.step",
-    "engine_mismatch": "the step of MJX differs from that of the C engine, as documented",
+    "engine_mismatch": "the step of MJX differs from that of the C engine as documented (docs/gradient-faults.md)",
     "apart": "the analytic counterpart is another model of the same system, approached as contact stiffens",
 }
 Codes = Int[np.ndarray, "outputs inputs"]

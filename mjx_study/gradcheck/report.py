@@ -12,6 +12,11 @@ from mjx_study.table import Column, as_plain, grouped, tabulate
 
 MAX_SHOWN: Final = 12
 """Maximum number of findings in the text, unless all are requested."""
+PLACES: Final = {
+    "pushed to": "a rollout with random pushes of so many m/s or rad/s, to what the task's own does not reach",
+    "from pose": "a fall from a random pose, likewise",
+}
+"""What the names of states mean that the rollout does not reach."""
 OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "engine_mismatch": "the C engine"}
 """Source of the compared number, if not finite differences."""
 HEADINGS: Final = {
@@ -216,8 +221,19 @@ class GradcheckReport:
         """Return the report as text; `verbose` lists every entry of every finding."""
         lines = [f"{self.subject}: {self.summary}", ""]
         if self.costs:
-            lines += ["gradient of the whole cost", *_table(self.costs, OF_COST), ""]
-        lines += ["one step", *_table(self.steps, OF_STEP), ""]
+            lines += ["gradient of the whole cost", *_table(self.costs, OF_COST)]
+            flat = any(check.gradient_norm == 0 for check in self.costs)
+            lines += (
+                ["|gradient| 0: the parameters do not affect the cost here, so that nothing is checked"] if flat else []
+            )
+            lines += [""]
+        lines += ["one step", *_table(self.steps, OF_STEP)]
+        if any(check.unresolved for check in self.steps):
+            most = max(self.steps, key=lambda check: check.unresolved / check.entries)
+            lines.append(
+                f"unresolved: entries of the Jacobian, of {most.entries}, whose differences are too uncertain to judge"
+            )
+        lines += [""]
         lines += self._coverage_lines()
         lines += self._finding_lines(verbose)
         lines += [f"warning: {text}" for text in (*self.warnings, *self._gaps())]
@@ -257,6 +273,8 @@ class GradcheckReport:
             lines.append(f"and {len(alike) - len(shown)} more (--details lists all)")
         verdicts = dict.fromkeys(finding.verdict for finding in self.findings)
         lines += [f"{verdict}: {MEANING[verdict]}" for verdict in verdicts if verdict in MEANING]
+        told = "\n".join(lines)
+        lines += [f"{name}: {meaning}" for name, meaning in PLACES.items() if name in told]
         return [*lines, ""] if lines else []
 
 

@@ -38,12 +38,22 @@ def numbers_of(dataset: xr.Dataset) -> tuple[list[str], list[list[str]]] | None:
     return [titles[index] for index in filled], [[row[index] for index in filled] for row in rows]
 
 
+def meanings_of(dataset: xr.Dataset) -> dict[str, str]:
+    """What the headings of a study's quantities mean."""
+    kind = kind_of(dataset)
+    return {kind.quantities[name].heading: kind.quantities[name].description for name in kind.columns}
+
+
 def _text(name: str, variable: Variable, one: xr.Dataset) -> str:
-    """Sum of counts, median of others over seeds and the last tenth of iterations; with the error of a single one."""
+    """Sum of counts, median of others over seeds and the last tenth of iterations; of a single one with error or
+    interval."""
     values, error = one[name], one.get(f"{name}_se")
     error = math.nan if error is None or error.size > 1 else error.item()
     if "iteration" in values.dims and variable.digits:
         values = values.isel(iteration=slice(-max(1, values.sizes["iteration"] // 10), None))
+    ends = [one[f"{name}_{end}"] for end in ("lower", "upper") if f"{name}_{end}" in one]
+    if ends and all(each.size == 1 for each in (values, *ends)) and np.isfinite(values.item()):
+        return variable.interval(values.item(), *(each.item() for each in ends))
     array = values.values[np.isfinite(values.values)].astype(float)
     if len(array) == 0:
         return "-"
@@ -51,7 +61,7 @@ def _text(name: str, variable: Variable, one: xr.Dataset) -> str:
         return variable.text(float(np.sum(array)))
     if name == DEBIASED["relative_error"]:
         return remains("relative_error", float(one["relative_error"].median()), float(np.median(array)), error)
-    return with_error(float(np.median(array)), error, variable.digits)
+    return with_error(variable.factor * float(np.median(array)), error, variable.digits)
 
 
 def shown(value: Any) -> str:

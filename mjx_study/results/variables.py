@@ -11,13 +11,15 @@ from mjx_study.table import described, number
 @dataclass(frozen=True)
 class Variable:
     """A quantity of a study: dimensions within a cell, unit ("gradient" is cost per unit of theta), description (whose
-    first clause labels axes), heading or symbol in tables, and significant digits in tables (0 for a count)."""
+    first clause labels axes), heading or symbol in tables, significant digits in tables (0 for a count), and what they
+    multiply it by."""
 
     dims: tuple[str, ...]
     unit: str
     description: str
     heading: str = ""
     digits: int = 3
+    factor: float = 1.0
 
     @property
     def shown_unit(self) -> str:
@@ -30,7 +32,13 @@ class Variable:
 
     def text(self, value: float | int | None) -> str:
         """Format a value for a table; `-` for None."""
-        return number(value, self.digits) if self.digits or value is None else f"{value:.0f}"
+        if value is None:
+            return "-"
+        return number(self.factor * value, self.digits) if self.digits else f"{value:.0f}"
+
+    def interval(self, value: float, low: float, high: float) -> str:
+        """Format a value with the ends of its interval."""
+        return f"{self.text(value)} ({number(low, 2)} to {number(high, 2)})"
 
 
 BATCH: Final = ("seed", "estimator")
@@ -74,7 +82,7 @@ GRADIENTS: Final = {
     "squared_bias_se": Variable(EACH, "1", "standard error of squared_bias"),
     "residual": Variable(EACH, "1", "largest relative residual of the constraint solver", "residual", 2),
     "unconverged": Variable(EACH, "1", "rollouts whose solver residual is too large", digits=0),
-    "seconds_per_sample": Variable(EACH, "s", "computing time of one sample, without compilation", "ms", 2),
+    "seconds_per_sample": Variable(EACH, "s", "computing time of one sample, without compilation", "ms", 2, 1e3),
     "onsets": Variable(EACH, "1", "onsets of contact in the first-order batches", digits=0),
     "onsets_bounded": Variable(EACH, "1", "onsets at grazing speed, with a bounded term", digits=0),
     "onsets_missed": Variable(
@@ -112,7 +120,9 @@ DESCENTS: Final = {
     "cost": Variable(STEP, "cost", "mean cost of the batch, before the update"),
     **{name: replace(GRADIENTS[name], dims=STEP) for name in HISTORY[1:]},
     "rollouts": Variable(EACH, "1", "rollouts simulated in one iteration of one seed", digits=0),
-    "seconds": Variable(STEP[::2], "s", "time of all seeds, measured; compilation excluded", "seconds"),
+    "seconds": Variable(
+        STEP[::2], "s", "time of all seeds, measured; compilation excluded, other estimators beside", "seconds"
+    ),
     "theta": Variable((*BATCH, "param"), THETA, "parameters of the final policy"),
 }
 LANDSCAPES: Final = {

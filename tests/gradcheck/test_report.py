@@ -1,6 +1,7 @@
 """Lines of a report and exit codes of the command, without a computation."""
 
 import dataclasses
+from pathlib import Path
 
 import mujoco
 import pytest
@@ -57,6 +58,19 @@ def test_unexercised_parts_are_a_warning_and_another_exit_code(
     assert any(line.startswith("warning: penalty, K = 100 N/m: no state exercises slide") for line in lines)
     assert lines[-1] == "every derivative that exists is right, where it was checked"
     assert report(unexercised).as_json()["unexercised"] == {"penalty, K = 100 N/m": ["slide"]}
+
+
+def test_what_is_shown_is_explained_and_nothing_else() -> None:
+    plain = "\n".join(report(dataclasses.replace(STEP, unresolved=0)).lines())
+    assert "unresolved:" not in plain and "pushed to:" not in plain and "|gradient| 0" not in plain
+    entry = Entry("step 50, pushed to 5", 50, 0.1, "qvel[x]", 1.0, 2.0)
+    finding = dataclasses.replace(wrong("engine_mismatch"), entries=(entry,))
+    cost = CostCheck("penalty", 100.0, 0.0, 0.0, 0.0, 0.0, None, 1e-16, "right")
+    found = dataclasses.replace(report(STEP, findings=(finding,)), costs=(cost,))
+    for start in ("unresolved: entries of the Jacobian, of 30,", "pushed to: ", "|gradient| 0: "):
+        assert sum(line.startswith(start) for line in found.lines()) == 1
+    (told,) = [line for line in found.lines() if line.startswith("engine_mismatch: ")]
+    assert (Path(__file__).parents[2] / told.partition("(")[2].partition(")")[0]).exists()
 
 
 def test_unreachable_parts_are_reported_and_not_missing() -> None:
