@@ -28,6 +28,8 @@ def main() -> None:
             if -1 < ratio < 12 and said != "no contact":
                 faint = 0.4 if said == "unknown" else 1.0
                 axes.barh(at, ratio, 0.38, color=f"C{i}", alpha=faint, label=f"{1000 * step:g} ms" if not row else None)
+                if abs(ratio) < 0.02:
+                    axes.text(0.05, at, f"{ratio:.3f}", va="center", fontsize=7)
             else:
                 kept = said in ("not measured", "no contact")
                 axes.text(1.1, at, said if kept else "not shown: NaN, below -1 or above 12", va="center", fontsize=7)
