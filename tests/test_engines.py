@@ -134,6 +134,37 @@ def test_a_variant_has_a_name_and_a_scene_of_its_own(
     assert [verdict(each) for each in written] == ["right"] * 2 and written[1]["scene"] == command.HALF
 
 
+@pytest.mark.parametrize(("other", "again"), [(1.0, False), (1.2, True), (20.0, False), (math.nan, False)])
+def test_what_is_undecided_is_measured_again_if_that_may_decide(
+    other: float, again: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def measured(simulate, scene, counts, *, single):
+        asked.append(counts)
+        return RIGHT | {"mean_of_strata": other}
+
+    monkeypatch.setattr(worker, "measure", measured)
+    monkeypatch.setattr(mujoco_family, "build", lambda *_: None)
+    monkeypatch.setattr(sys, "argv", ["worker", "mjx", "toss", "0.005"])
+    worker.main()
+    assert asked == [worker.MANY, worker.MORE][: 1 + again]
+
+
+@pytest.mark.parametrize("step", TIMESTEPS)
+@pytest.mark.parametrize("scene", ["slide", "box_flat", "box_edge"])
+def test_derivatives_of_boxes_explode_in_the_line_search_and_are_right_with_exact_forces(
+    scene: str, step: float
+) -> None:
+    """Motion and slope are the same; exact means are off as MJX's are."""
+    found = cells(CELLS)
+    plain, short, exact = (found[f"brax_generalized{kind}", scene, step] for kind in ("", "_short", "_exact"))
+    assert plain["point_share"] < 0.1 and abs(plain["mean"]) > 1e4
+    assert exact["point_share"] > 0.95 and exact["mean"] == pytest.approx(found["mjx", scene, step]["mean"], abs=0.1)
+    assert short["mean"] == pytest.approx(exact["mean"], abs=0.1)
+    assert [plain["slope"], short["slope"]] == pytest.approx([exact["slope"]] * 2, rel=0.05)
+
+
 @pytest.mark.parametrize("name", ["slide", "box_flat"])
 def test_the_rigid_limit_is_that_of_the_c_engine(name: str) -> None:
     scene, thetas = SCENES[name], SCENES[name].center + SCENES[name].sigma * np.array([-1.0, 0.3, 1.0])
@@ -212,7 +243,10 @@ print(json.dumps([found.positions[0, 0].tolist(), float(found.values[0]), float(
 """
 
 
-@pytest.mark.parametrize("name", ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap", "nimble", "mujoco_torch_plain"])
+@pytest.mark.parametrize(
+    "name",
+    ["mjx", "newton_semi_implicit", "jaxsim", "drake_sap", "nimble", "mujoco_torch_plain", "brax_generalized_exact"],
+)
 def test_free_flight_of_what_is_installed(name: str) -> None:
     engine = catalog.ENGINES[name]
     python = catalog.interpreter(engine)

@@ -213,7 +213,7 @@ def test_the_graph_has_the_packages_own_derivative(law: str, monkeypatch: pytest
 def test_diagnose_judges_means_under_every_law(monkeypatch: pytest.MonkeyPatch) -> None:
     """What begins, and how much its step varies, hardly depend on the law: the ball flies freely until then."""
     printed, found, pages = [], {}, {}
-    monkeypatch.setattr("mjx_study.cli.diagnose.print_report", lambda _, *given: printed.append(given))
+    monkeypatch.setattr("mjx_study.cli.diagnose.print_report", lambda _, *given: printed.append(given) or 0)
     for law in ("mujoco", "hunt_crossley", "log_barrier"):
         options = ["--contact", law, "--samples", "60", "--horizon", "240"]
         assert cli.main(["diagnose", "momentum_transfer", *options]) == 0

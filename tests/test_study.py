@@ -18,7 +18,7 @@ from estimators.registry import label_of
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.execution.run import run_study
-from mjx_study.experiment import sampling
+from mjx_study.experiment import tally
 from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of
@@ -317,7 +317,7 @@ def test_warnings_name_what_must_not_be_overlooked() -> None:
 
 
 def test_an_unconverged_solve_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sampling.MOST_RESIDUAL, "float64", 1e-30)
+    monkeypatch.setitem(tally.MOST_RESIDUAL, "float64", 1e-30)
     found = compare(stiffness=(10.0,), contact=("penalty",), chunk_size=4)
     assert all(row.unconverged > 0 for row in rows_of(found))
     assert any("the contact solver did not converge" in warning for warning in warnings_of(found))

@@ -20,8 +20,7 @@ from mjx_study.compiled import Compiled
 from mjx_study.diagnose.setting import touch_of
 from mjx_study.experiment.reference_gradient import estimate_reference
 from mjx_study.experiment.resolution import direction_of
-from mjx_study.experiment.sampling import unconverged
-from mjx_study.experiment.tally import onset_numbers
+from mjx_study.experiment.tally import onset_numbers, unconverged
 from mjx_study.objective import SamplePrograms, rollout_cost, spread
 from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import local_devices

@@ -34,7 +34,7 @@ def main() -> None:
     axes.axvline(1, color="black", linewidth=1)
     axes.set_yticks(range(len(names)), [ENGINES[name].label for name in names])
     axes.invert_yaxis()
-    axes.set_xlabel("E[FoBG] / slope of the mean cost (right: 1; pale: undecided)")
+    axes.set_xlabel("E[FoBG] / slope of the mean cost\n(right: 1; pale: undecided)")
     axes.legend(loc="lower right")
     save_figure(figure, "engines")
 

@@ -19,8 +19,8 @@ from estimators.mean_check import NODES
 from mjx_study.compiled import Builds
 from mjx_study.diagnose.means import MAX_PATHS, along_means, in_nodes, reach_of, unmixed
 from mjx_study.experiment.memory import fits_in_memory
-from mjx_study.experiment.sampling import cell_keys, draw_batches, unconverged
-from mjx_study.experiment.tally import onset_numbers
+from mjx_study.experiment.sampling import cell_keys, draw_batches
+from mjx_study.experiment.tally import onset_numbers, unconverged
 from mjx_study.objective import BlankObjective, Simulator, chunk_for
 from mjx_study.progress import Progress, silent
 from mjx_study.results.variables import ONSETS

@@ -3,28 +3,38 @@
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future
-from contextlib import suppress
 from typing import Any
 
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.study import Computation, StudyPlan, Work
 from mjx_study.progress import Progress
-from mjx_study.storage.folder import Store
 
 
 class Cells:
-    """Cells of a plan, from their checkpoints in a folder, if there is one, to their numbers."""
+    """Cells of a plan, from their checkpoints to their numbers.
 
-    def __init__(self, plan: StudyPlan, computation: Computation, progress: Progress, store: Store | None = None):
+    Args:
+        checkpoint: the checkpoint of a cell, from its index and what reports progress within it.
+    """
+
+    def __init__(
+        self,
+        plan: StudyPlan,
+        computation: Computation,
+        progress: Progress,
+        checkpoint: Callable[[int, Progress], Checkpoint] = lambda _, report: Checkpoint(report=report),
+    ):
         self.plan, self.computation = plan, computation
-        self._progress, self._store = progress, store
+        self._progress, self._checkpoint = progress, checkpoint
         self.done = 0
         self._works: dict[int, tuple[Checkpoint, Work]] = {}
         self._compiled: set[Any] = {None}
 
     def begin(self, index: int) -> list[int]:
         """Begin a cell, and return its unfinished work units."""
-        checkpoint = self._checkpoint(index)
+        alone, label = len(self.plan.cells) == 1, self.label(index)
+        within = self._progress if alone else lambda done, total, what: self.report(label)
+        checkpoint = self._checkpoint(index, within)
         work = self.computation.begin(self.plan.cells[index], checkpoint)
         self._works[index] = checkpoint, work
         return work.missing
@@ -72,21 +82,6 @@ class Cells:
 
     def report(self, what: str) -> None:
         self._progress(self.done, len(self.plan.cells), what)
-
-    def _checkpoint(self, index: int) -> Checkpoint:
-        """A cell's checkpoint; failing to write it must not cost the cell."""
-        label, store = self.label(index), self._store
-
-        def within(done: int, total: int, what: str) -> None:
-            self._progress(done, total, what) if len(self.plan.cells) == 1 else self.report(label)
-
-        def save(arrays: Arrays) -> None:
-            with suppress(OSError):
-                store.write_part(index, arrays)  # type: ignore[union-attr]
-
-        if store is None:
-            return Checkpoint(report=within)
-        return Checkpoint(store.read_part(index), save, within, str(store.part_path(index)))
 
 
 Executor = Callable[[Cells, Iterable[int]], Generator[tuple[int, Arrays | str]]]

@@ -96,7 +96,7 @@ def _in_folder(
     total = len(plan.cells)
     for index in range(total):  # reject damaged files before computing anything
         store.read(index) if store.has(index) else store.read_part(index)
-    cells = Cells(plan, plan.kind.computation(plan), progress, store)
+    cells = Cells(plan, plan.kind.computation(plan), progress, store.checkpoint)
     held: dict[int, tuple[Arrays, dict[str, str]]] = {}
     failed: dict[int, str] = {}
     computed = 0

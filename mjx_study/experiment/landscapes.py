@@ -27,8 +27,9 @@ from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.gradient_numbers import estimate_of, padded
 from mjx_study.experiment.quadrature import QUADRATURE, Line, Means, applies, closed_form, grid, means
 from mjx_study.experiment.resolution import line_of
-from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, unconverged
+from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
+from mjx_study.experiment.tally import unconverged
 from mjx_study.options.option import OptionError
 from mjx_study.results.curves import landscape_findings, least_of
 from mjx_study.results.kind import Drawing

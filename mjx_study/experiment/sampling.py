@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,6 @@ from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
 from mjx_study.tasks.task import Task
-
-MOST_RESIDUAL: Final = {"float64": 1e-6, "float32": 1e-3}
-"""Relative solver residual above which a sample is reported as unconverged."""
 
 
 class Objectives:
@@ -134,8 +131,3 @@ def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
     parts = batch if isinstance(batch, tuple) else (batch,)
     steps = [part.steps if isinstance(part, Linearisation) else part for part in parts]
     return np.concatenate([np.zeros(0) if part.residual is None else np.asarray(part.residual) for part in steps])
-
-
-def unconverged(residuals: np.ndarray, precision: str) -> int:
-    """Number of residuals that are too large or nonfinite."""
-    return int(np.sum(~(residuals <= MOST_RESIDUAL[precision])))

@@ -3,13 +3,15 @@
 import dataclasses
 from collections.abc import Iterable
 from functools import reduce
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.experiment.sampling import unconverged
 from mjx_study.runtime import precision
+
+MOST_RESIDUAL: Final = {"float64": 1e-6, "float32": 1e-3}
+"""Relative solver residual above which a sample is reported as unconverged."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,3 +87,8 @@ def numbers_of(onsets: np.ndarray) -> np.ndarray:
     if rollouts == 0:
         return np.full(6, np.nan)
     return np.array([*counts, *(np.sqrt(each / met) if met else np.nan for each in (squares, spread)), replaced])
+
+
+def unconverged(residuals: np.ndarray, precision: str) -> int:
+    """Number of residuals that are too large or nonfinite."""
+    return int(np.sum(~(residuals <= MOST_RESIDUAL[precision])))

@@ -6,6 +6,7 @@ import json
 import tomllib
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,6 +36,29 @@ class SavedPolicy:
 
     task: str
     options: Mapping[str, Any]
+
+
+@cache
+def _adapter(schema: Any) -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(schema)
+
+
+def validated(schema: Any, content: bytes | str) -> Any:
+    """Read JSON of a type; a ValueError names the first key that violates it, and counts the others."""
+    from pydantic import ValidationError
+
+    try:
+        return _adapter(schema).validate_json(content)
+    except ValidationError as error:
+        found = error.errors(include_url=False, include_input=False)
+    first = found[0]
+    key = ".".join(map(str, first["loc"]))
+    raised = first.get("ctx", {}).get("error")  # from a validator of ours; pydantic adds words to its message
+    reason = str(raised) if isinstance(raised, ValueError) else first["msg"]
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    raise ValueError(f"{key}{': ' * bool(key)}{' '.join(reason.split())}{more}")
 
 
 def digest_of_json(document: Mapping[str, Any]) -> str:

@@ -14,8 +14,8 @@ import numpy as np
 
 from mjx_study.disk import read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
+from mjx_study.options.files import validated
 from mjx_study.storage.arrays import MOST_CELL_BYTES, read_arrays, write_arrays
-from mjx_study.storage.manifest import validated
 
 VERSIONS: Final = "versions"
 """Entry that records the versions that computed a cell."""

@@ -24,10 +24,11 @@ import xarray as xr
 
 from estimators.user_inputs import inputs_now
 from mjx_study.disk import MAX_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
-from mjx_study.experiment.checkpoint import StudyError, reason_of
+from mjx_study.experiment.checkpoint import Checkpoint, StudyError, reason_of
 from mjx_study.experiment.study import StudyPlan
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.options.files import digest_of_json
+from mjx_study.progress import Progress
 from mjx_study.storage.arrays import check_cell
 from mjx_study.storage.cell_files import CellFile
 from mjx_study.storage.dataset import dataset_of
@@ -164,6 +165,15 @@ class Store:
 
     def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         self.file(index, part=True).write(arrays, self._authors(index))
+
+    def checkpoint(self, index: int, report: Progress) -> Checkpoint:
+        """A cell's checkpoint; failing to write it must not cost the cell."""
+
+        def save(arrays: Mapping[str, np.ndarray]) -> None:
+            with suppress(OSError):
+                self.write_part(index, arrays)
+
+        return Checkpoint(self.read_part(index), save, report, str(self.part_path(index)))
 
     def _authors(self, index: int) -> dict[str, str]:
         """Versions that computed a cell, including those of its checkpoint."""

@@ -1,14 +1,13 @@
 """study.json: what a plan writes into it, and its schema; files from elsewhere are validated before use."""
 
 import dataclasses
-import functools
 import json
 import math
 from collections import Counter, defaultdict
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from estimators import Estimator, find_estimator
 from estimators.choices import ORACLES
@@ -19,7 +18,7 @@ from mjx_study.experiment.study import StudyCell, StudyPlan, estimators_of
 from mjx_study.graph.native import computes_steps
 from mjx_study.identity import git_revision, versions
 from mjx_study.options.configuration import OPTIONS
-from mjx_study.options.files import digest_of_json
+from mjx_study.options.files import digest_of_json, validated
 from mjx_study.runtime import environment
 from mjx_study.table import digits_to_tell_apart
 
@@ -29,9 +28,6 @@ SEEDS: Final = Interval(OPTIONS["seeds"].interval)
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Count = Annotated[int, Field(ge=1, le=10_000_000)]
-
-
-_ADAPTER: Final = functools.cache(TypeAdapter)
 
 
 class _Part(BaseModel):
@@ -132,20 +128,6 @@ class _Format(BaseModel):
     model_config = ConfigDict(strict=True)
 
     format: int
-
-
-def validated(schema: Any, content: bytes | str) -> Any:
-    """Read JSON of a type; a ValueError names the first key that violates it, and counts the others."""
-    try:
-        return _ADAPTER(schema).validate_json(content)
-    except ValidationError as error:
-        found = error.errors(include_url=False, include_input=False)
-    first = found[0]
-    key = ".".join(map(str, first["loc"]))
-    raised = first.get("ctx", {}).get("error")  # from a validator of ours; pydantic adds words to its message
-    reason = str(raised) if isinstance(raised, ValueError) else first["msg"]
-    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    raise ValueError(f"{key}{': ' * bool(key)}{' '.join(reason.split())}{more}")
 
 
 def read_format(content: bytes | str) -> int:
