@@ -175,7 +175,8 @@ def test_the_commands_on_the_page_repeat_it(model: str, capsys: pytest.CaptureFi
 
 def planted(**changes: object) -> Measured:
     numbers = {"estimator": "fobg", "variance": 4.0, "lower": 3.0, "upper": 5.0, "seconds": 0.01}
-    numbers |= {"paths": (), "verdict": "unbiased", "off": 0.0, "off_error": 0.0, "bias": 0.0, "norm": 2.0, "lost": 0}
+    numbers |= {"paths": (), "verdict": "unbiased", "off": 0.0, "off_error": 0.0, "bias": 0.0, "norm": 2.0}
+    numbers |= {"slope": 0.0, "lost": 0}
     return Measured(**(numbers | changes))  # type: ignore[arg-type]
 
 
@@ -303,6 +304,26 @@ def test_without_a_significant_gradient_zeroth_order_is_advised_and_no_mean_judg
     for one, why in ((nothing, "the gradient is 0"), (rare, "no estimator without visible bias has a finite variance")):
         ((text, _),) = advise(one)
         assert text.startswith(f"no estimator can be recommended: {why};")
+
+
+def test_the_mean_costs_slope_stands_in_for_a_gradient_that_zeroth_order_does_not_resolve(found: Diagnosis) -> None:
+    """All first-order means are biased, by a third of that slope, and their noise is small."""
+    noisy = planted(estimator="zobg", variance=1e4, lower=9e3, upper=1.1e4, norm=0.1)
+    off = {"verdict": "biased", "off": 0.2, "off_error": 0.01, "bias": 0.2, "paths": (crossed(0.2, 0.01),)}
+    first = planted(variance=0.02, lower=0.01, upper=0.03, norm=0.7, slope=0.6, **off)
+    term = dataclasses.replace(first, estimator="fobg_onset", variance=0.03)
+    told = dataclasses.replace(found, samples=500, estimators=(first, term, noisy))
+    assert told.by_slope and told.resolved and told.norm == 0.6
+    assert told.norm_error == pytest.approx(math.hypot(0.01, math.sqrt(0.02 / 500)))
+    (text, _), *_ = advise(told)
+    assert "take fobg; its bias of 33.3 ± 1.8 % remains" in text
+    assert any(
+        "relative to the slope of the mean cost along a path, 0.600 ± 0.012" in line for line in page_lines(told)
+    )
+    unsure = dataclasses.replace(first, off_error=0.4)
+    assert not dataclasses.replace(told, estimators=(noisy, unsure)).resolved
+    seen = dataclasses.replace(told, estimators=(first, dataclasses.replace(noisy, norm=50.0)))
+    assert not seen.by_slope and seen.norm == 50.0
 
 
 def crossed(gap: float, error: float, quadrature: float = 0.0, effective: float = 100.0) -> Circulation:

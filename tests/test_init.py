@@ -208,7 +208,7 @@ def test_a_wheel_on_its_axle_is_to_turn() -> None:
 def test_a_coordinate_is_named_by_its_joint(begin: Callable[..., Begun]) -> None:
     task, _, written, found = begin(WHEEL)
     distance = f"{found.aim.distance:g} rad"
-    assert task.description == f"move swing by {distance}; open-loop controls"
+    assert task.description == f"move swing by {found.aim.side * found.aim.distance:g} rad; open-loop controls"
     assert f"The goal is {distance} away." in written.read_text() and "# By itself swing ends at" in written.read_text()
 
 
@@ -219,6 +219,14 @@ def test_a_load_that_hardly_moves_is_no_task() -> None:
     arm, _, rest = ARM.partition('<body name="ball"')
     aim = proposed(arm + block + "</body></worldbody>" + rest.partition("</worldbody>")[2]).aim
     assert aim.role == "tip" and aim.distance > 0.01
+
+
+def test_a_goal_behind_is_a_negative_distance() -> None:
+    found = proposed(LEG)
+    back = dataclasses.replace(found, aim=dataclasses.replace(found.aim, side=-1))
+    for each, sign in ((found, ""), (back, "-")):
+        text = source_of_task(Path("leg.xml"), each)
+        assert f'description="move torso by {sign}{found.aim.distance:g} m along x; open-loop controls"' in text
 
 
 def test_a_learning_rate_lowers_the_cost() -> None:

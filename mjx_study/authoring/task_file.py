@@ -63,7 +63,7 @@ def source_of_task(mjcf: Path, found: Proposal) -> str:
         timestep=found.scene.timestep,
         touches=[_touch(found, pair, touch) for pair, touch in by_time],
         actuators=[_actuator(host, index) for index in range(host.nu)],
-        description=f"move {_comment(subject)} by {aim.distance:g}{unit}"
+        description=f"move {_comment(subject)} by {aim.side * aim.distance:g}{unit}"
         + (f" along {'xyz'[aim.axis]}; " if body is not None else "; ")
         + ("initial velocities" if drive.at_start else "open-loop controls"),
     )

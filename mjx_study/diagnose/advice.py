@@ -151,7 +151,7 @@ def _onset(found: Diagnosis) -> Iterator[Advice]:
     ):
         yield (
             f"the onset term leaves a bias of {found.off_text(corrected)}, which its own error does not "
-            "explain; the usual causes are corners, edges, grazing and rolling contact: take zobg there",
+            "explain; the usual causes are corners, edges, grazing and rolling contact; only zobg is surely unbiased",
             "",
         )
     elif linear > NOTABLE_SHARE:

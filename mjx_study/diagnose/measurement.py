@@ -62,6 +62,7 @@ class Measured:
             [gradient].
         bias: the same, but if undecided with its standard error added (in squares) [gradient].
         norm: norm of the mean, without what noise adds to it [gradient].
+        slope: slope of the mean cost along the first path [gradient]; 0 without paths.
         lost: number of excluded nonfinite samples.
     """
 
@@ -76,6 +77,7 @@ class Measured:
     off_error: float
     bias: float
     norm: float
+    slope: float
     lost: int
 
     def error(self, norm: float, variance: float | None = None, bias: float | None = None) -> float:
@@ -120,17 +122,38 @@ class Measurement:
         return min((each for each in self.estimators if each.verdict != "biased"), key=lambda each: each.variance)
 
     @property
+    def by_slope(self) -> bool:
+        """Whether the gradient's norm is the mean cost's slope along a path: unbiased estimates are too noisy."""
+        (norm, error), (slope, uncertainty) = self._of_surest, self._slope
+        return norm <= RESOLVED_SE * error and slope > RESOLVED_SE * uncertainty
+
+    @property
+    def _of_surest(self) -> tuple[float, float]:
+        return self.surest.norm, math.sqrt(self.surest.variance / self.samples)
+
+    @property
+    def _slope(self) -> tuple[float, float]:
+        """Slope along a path and its standard error, from those of the integrated mean and of the gap."""
+        errors = [(math.hypot(each.off_error, math.sqrt(each.variance / self.samples)), each) for each in self._derived]
+        error, known = min(errors, key=lambda each: each[0], default=(math.inf, None))
+        return (known.slope, error) if known else (0.0, error)
+
+    @property
+    def _derived(self) -> list[Measured]:
+        return [each for each in self.estimators if each.paths]
+
+    @property
     def norm(self) -> float:
         """Norm of the gradient, or its standard error if that is larger."""
-        return max(self.surest.norm, self.norm_error)
+        return self._slope[0] if self.by_slope else max(self.surest.norm, self.norm_error)
 
     @property
     def norm_error(self) -> float:
-        return math.sqrt(self.surest.variance / self.samples)
+        return (self._slope if self.by_slope else self._of_surest)[1]
 
     @property
     def resolved(self) -> bool:
-        return self.surest.norm > RESOLVED_SE * self.norm_error
+        return self.by_slope or self.surest.norm > RESOLVED_SE * self.norm_error
 
     @property
     def best(self) -> Measured:
@@ -272,5 +295,6 @@ def _measured(
         off_error=off_error,
         bias=bias,
         norm=math.sqrt(max(squared, 0.0)),
+        slope=abs(float(paths[0].difference)) / (2 * reach) if paths else 0.0,
         lost=int(estimate.num_nonfinite),
     )

@@ -87,8 +87,9 @@ def page_lines(found: Diagnosis) -> list[str]:
     steps = re.sub(r" --theta ('[^']*'|\S+)", "", steps) if is_file(found.subject) else steps
     lines += ["", "derivatives of a step", f"  {_derivatives(found)}", steps]
     if found.resolved:
-        norm = with_error(found.surest.norm, found.norm_error)
-        heading = f"estimators, by their error relative to the gradient, {norm}, after a second of computing"
+        of = "slope of the mean cost along a path" if found.by_slope else "gradient"
+        norm = with_error(found.norm, found.norm_error)
+        heading = f"estimators, by their error relative to the {of}, {norm}, after a second of computing"
     else:
         heading = "estimators, by their error, in the gradient's unit, after a second of computing"
     batch = f"--estimators {','.join(each.estimator for each in found.estimators)} --samples {found.samples}"
