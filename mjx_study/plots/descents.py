@@ -124,24 +124,23 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
             name, colour, marker = style_of("fobg", onset_of(part))
             first = {"color": colour, "marker": marker}
             below.plot(t, one["exact_first"], **first, **above_all, label=f"mean of {name}, quadrature")
-        told = []
+        notes = []
         for mine, style in estimators(one):
             slope, low, high = _interval(mine["slope"], mine["slope_se"])
             if np.mean((low < 0) & (high > 0)) > MOST_UNRESOLVED:
                 unresolved.append(slope)
-                told.append(f"{style['label']} not resolved (± {number(float(np.median(high - low)) / 2, 2)})")
+                notes.append(f"{style['label']} not resolved (± {number(float(np.median(high - low)) / 2, 2)})")
             else:
                 slopes.append(slope)
             style["label"] = f"mean of {style['label']}"
             line_with_band(below, t, slope, low, high, **style)
-        if told:
-            below.text(0.02, 0.97, "\n".join(told), transform=below.transAxes, va="top", fontsize="small")
+        if notes:
+            below.text(0.02, 0.97, "\n".join(notes), transform=below.transAxes, va="top", fontsize="small")
         above.set_title(model_title(one, ",\n"), fontsize="medium")
         below.axhline(0, color="0.7", linewidth=0.8)
         below.set_xlabel(along)
-    low, high = robust_limits(
-        [np.zeros(1), *(slopes or unresolved)]
-    )  # slopes far beyond that of the mean cost leave the axes
+    # slopes far beyond that of the mean cost leave the axes
+    low, high = robust_limits([np.zeros(1), *(slopes or unresolved)])
     if steepest > 0:
         low, high = max(low, -MOST_SLOPE_RATIO * steepest), min(high, MOST_SLOPE_RATIO * steepest)
     grid[1, 0].set_ylim(min(low, -ROOM_AT_ZERO * high), max(high, -ROOM_AT_ZERO * low))
