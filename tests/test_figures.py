@@ -182,7 +182,7 @@ def test_a_zero_is_marked_below_and_a_ratio_of_nothing_in_its_place() -> None:
 def test_figures_and_reports_of_extreme_numbers_warn_of_nothing(kind: str, value: float) -> None:
     """Warnings are errors here."""
     models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
-    counts = {"nonfinite", "unconverged", "position", "residual", *ONSETS}
+    counts = {"nonfinite", "unconverged", "position", "residual", "rollouts", *ONSETS}
     config = json.dumps({"confidence": 0.95, "direction": None, "tasks": ["pusher"], "theta": [], "kind": kind})
     for where in (along("model", True, False, False), along("model", True, True, True)):
         extreme = {name: xr.where(where, value, 0.5) for name in find_kind(kind).variables if name not in counts}

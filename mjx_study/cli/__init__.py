@@ -30,7 +30,7 @@ start here:
   mjx-study landscape ball_wall --output out     the cost, its mean under noise, and the slopes that estimators see
   mjx-study rollout tennis                       pictures and a film of a task
   mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not
-  mjx-study init robot.xml                       a task of your own: writes robot_task.py, which every command runs
+  mjx-study init robot.xml                       writes a task of your own: robot_task:robot in every command
   mjx-study diagnose robot.xml                   any MJCF: what contact does to gradients, and what to do about it
   mjx-study bench pusher                         what does a gradient cost on this machine?
 """

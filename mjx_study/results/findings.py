@@ -129,7 +129,7 @@ def _meaningless(rows: Sequence[Row], gammas: Bounds, label: Callable[[str], str
     several = [group for group in _by(rows, "estimator", "seed").values() if len(group) > 1]
     numbers = [[(row.gradient_norm, row.variance) for row in group] for group in several]
     if numbers and all(np.allclose(each, each[0], rtol=1e-12, atol=0, equal_nan=True) for each in numbers):
-        found.append("nothing depends on K: the contact whose stiffness is swept was never active")
+        found.append("nothing depends on K: the swept contact never acts, or not on what the cost reads")
     if unsure := [row for row in rows if row.reference_uncertainty > MOST_UNCERTAINTY]:
         found.append(
             f"the reference's own uncertainty exceeds {percent(MOST_UNCERTAINTY)}{_at(unsure)}: errors and shares "
