@@ -198,8 +198,8 @@ FINDINGS: dict[str, tuple[list[dict[str, Any]], float | str, list[str]]] = {
         ["FoBG's variance is undecided .too few effective samples. at K = 10 N/m"],
     ),
     "what noise explains": ([row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.002)], 1e8, []),
-    "bias": ([row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.001)], 1e8, ["biased by 4.4 ± 1.0 % at K = 10"]),
-    "large bias": ([row("aobg", 10, 1, relative_error=16.95, bias_p_value=0.001)], 1e8, ["biased by 1695.0 ± 1.0 %"]),
+    "bias": ([row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.001)], 1e8, ["biased by 4.4 ± 0 % at K = 10"]),
+    "large bias": ([row("aobg", 10, 1, relative_error=16.95, bias_p_value=0.001)], 1e8, ["biased by 1700 ± 0 %"]),
     "no bound": (UNBOUNDED, "inf", ["biased by 44.0 ± 3.0 % .*: it has no accuracy bound; set one with --gamma"]),
     "onset term": ([row("fobg_onset", 10, 1, **LOUD)], 1e8, ["FoBG .onset.'s mean is biased by 44.0 ± 3.0 %"]),
     "beyond computing": (
@@ -276,7 +276,7 @@ def test_seeds_are_counted_and_not_repeated() -> None:
     parts = [result(row("zobg", 10, variance), each) for each, variance in zip(rows, (100, 100, 1), strict=True)]
     assert findings_of(joined("seed", [0, 1, 2], parts)) == [
         "penalty: FoBG's variance is not significantly different from ZoBG's at K = 10 N/m (95 % intervals)",
-        "penalty: FoBG's mean is biased by 2.5 ± 1.0 % at K = 10 N/m in 2 of 3 seeds (p <= 0.001)",
+        "penalty: FoBG's mean is biased by 2.5 ± 0 % at K = 10 N/m in 2 of 3 seeds (p <= 0.001)",
     ]
     below = joined("seed", [0, 1], parts[:2])
     assert findings_of(below)[0] == "penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95 % intervals)"

@@ -238,7 +238,7 @@ def _share(rows: Sequence[Row]) -> str:
     if any(row.reference_uncertainty > MOST_UNCERTAINTY for row in rows):
         return "an unknown share"
     share = float(np.median([row.debiased_error for row in rows]))
-    error = max(max(row.debiased_error_se, row.reference_uncertainty) for row in rows)
+    error = max(row.debiased_error_se for row in rows)
     if not math.isfinite(share):
         return "more than can be computed"
     return f"{with_error(100 * share, 100 * error)} %"
