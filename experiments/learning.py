@@ -376,8 +376,8 @@ def figure(lines: list[dict[str, Any]]) -> Figure:
 
 def _new_seeds(lines: list[dict[str, Any]], name: str, method: str) -> list[dict[str, Any]]:
     """The lines of seeds that no learning rate was chosen by."""
-    found = [each for each in lines if (each["task"], each["method"]) == (name, method) and "final" in each]
-    found = [each for each in found if each["what"] != "tune"]
+    found = [each for each in lines if (each["task"], each["method"]) == (name, method)]
+    found = [each for each in found if each["what"] in ("learn", "ppo")]
     return [each for each in found if each.get("seed", 100) >= 100]
 
 

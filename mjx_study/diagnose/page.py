@@ -155,16 +155,11 @@ def _estimate(found: Diagnosis, each: Measured) -> tuple[str, str, str, str]:
     shown, least, most = (found.error_text(value, uncertainty) for value in (error, low, high))
     mean = f"off by {found.off_text(each)}" if each.verdict == "biased" else each.verdict
     judged = found.resolved or each.verdict in ("biased", "unbiased")
-    return (
-        shown,
-        f"{least} to {most}"
-        if high <= MAX_ERROR * found.norm
-        else f"at least {least}"
-        if low > error / 10
-        else UNKNOWN,
-        mean if judged else NOT_JUDGED,
-        f"{1e3 * each.seconds:.3g}",
-    )
+    if high <= MAX_ERROR * found.norm:
+        interval = f"{least} to {most}"
+    else:
+        interval = f"at least {least}" if low > error / 10 else UNKNOWN
+    return shown, interval, mean if judged else NOT_JUDGED, f"{1e3 * each.seconds:.3g}"
 
 
 def _unresolved(found: Diagnosis) -> str:

@@ -222,11 +222,9 @@ class GradcheckReport:
         lines = [f"{self.subject}: {self.summary}", ""]
         if self.costs:
             lines += ["gradient of the whole cost", *_table(self.costs, OF_COST)]
-            flat = any(check.gradient_norm == 0 for check in self.costs)
-            lines += (
-                ["|gradient| 0: the parameters do not affect the cost here, so that nothing is checked"] if flat else []
-            )
-            lines += [""]
+            if any(check.gradient_norm == 0 for check in self.costs):
+                lines.append("|gradient| 0: the parameters do not affect the cost here, so that nothing is checked")
+            lines.append("")
         lines += ["one step", *_table(self.steps, OF_STEP)]
         if any(check.unresolved for check in self.steps):
             most = max(self.steps, key=lambda check: check.unresolved / check.entries)
@@ -273,8 +271,8 @@ class GradcheckReport:
             lines.append(f"and {len(alike) - len(shown)} more (--details lists all)")
         verdicts = dict.fromkeys(finding.verdict for finding in self.findings)
         lines += [f"{verdict}: {MEANING[verdict]}" for verdict in verdicts if verdict in MEANING]
-        told = "\n".join(lines)
-        lines += [f"{name}: {meaning}" for name, meaning in PLACES.items() if name in told]
+        text = "\n".join(lines)
+        lines += [f"{name}: {meaning}" for name, meaning in PLACES.items() if name in text]
         return [*lines, ""] if lines else []
 
 

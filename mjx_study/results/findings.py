@@ -183,7 +183,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Bounds, label: Callable[[str], s
             fewest = [min(row.effective_samples, row.reference_effective_samples) for row in same]
             held = f"{min(fewest):.1f}" if all(row.effective_samples for row in same) else "all equal"
             sentences.append(
-                f"{mean} off by {_share(same)}{_of(same, seeds)}, from bias or lack of rare samples: "
+                f"{mean} off by {_share(same)}{_at(same)}{_often(same, seeds)}, from bias or lack of rare samples: "
                 f"too few effective samples ({held})"
             )
     return sentences
@@ -220,16 +220,12 @@ def _off(row: Row) -> bool:
     return row.bias_p_value <= BIASED_P_VALUE or row.debiased_error > OFF_SE * row.debiased_error_se
 
 
-def _of(rows: Sequence[Row], seeds: int) -> str:
-    """Where rows are, and how many of the seeds they are."""
-    return _at(rows) + _often(rows, seeds)
-
-
 def _share_of(rows: Sequence[Row], seeds: int) -> tuple[str, str]:
     return _share(rows), _often(rows, seeds)
 
 
 def _often(rows: Sequence[Row], seeds: int) -> str:
+    """How many of the seeds rows are."""
     return f" in {len(rows)} of {seeds} seeds" if seeds > 1 else ""
 
 

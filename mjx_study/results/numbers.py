@@ -61,7 +61,7 @@ def _text(name: str, variable: Variable, one: xr.Dataset) -> str:
         return variable.text(float(np.sum(array)))
     if name == DEBIASED["relative_error"]:
         return remains("relative_error", float(one["relative_error"].median()), float(np.median(array)), error)
-    return with_error(variable.factor * float(np.median(array)), error, variable.digits)
+    return with_error(variable.factor * float(np.median(array)), variable.factor * error, variable.digits)
 
 
 def shown(value: Any) -> str:

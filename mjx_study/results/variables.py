@@ -38,7 +38,7 @@ class Variable:
 
     def interval(self, value: float, low: float, high: float) -> str:
         """Format a value with the ends of its interval."""
-        return f"{self.text(value)} ({number(low, 2)} to {number(high, 2)})"
+        return f"{self.text(value)} ({number(self.factor * low, 2)} to {number(self.factor * high, 2)})"
 
 
 BATCH: Final = ("seed", "estimator")
