@@ -11,7 +11,7 @@ from mjx_study import disk, runtime
 from mjx_study.caches import digested, read_cached, undigested, write_cached
 from mjx_study.disk import private_folder
 from mjx_study.runtime import configure, traces_folder
-from tests.faults import deadline, put_no_file
+from tests.faults import NO_FILES, deadline, put_no_file
 from tests.processes import run_script
 
 
@@ -23,7 +23,7 @@ def test_a_digest_is_checked() -> None:
                 undigested(damaged)
 
 
-@pytest.mark.parametrize("kind", ["fifo", "socket", "folder", "device"])
+@pytest.mark.parametrize("kind", NO_FILES)
 def test_non_regular_files_are_not_read(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "entry"
     assert read_cached(path) is None

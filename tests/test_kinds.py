@@ -78,6 +78,7 @@ def test_a_folder_holds_what_a_run_returns(studies: dict[str, Path], name: str) 
     """As does memory; and every variable has a unit and a name, and a cell all that its kind requires."""
     loaded = load_study(studies[name])
     assert same(run_study(config(name)), loaded) and loaded.attrs["missing_cells"] == 0
+    assert not same(run_study(config(name, seed=1)), loaded)
     with xr.open_dataset(studies[name] / "results.nc") as stored:
         assert stored.equals(loaded)
     assert set(required(find_kind(config(name).settings.kind))) <= set(loaded)

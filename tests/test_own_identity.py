@@ -42,12 +42,6 @@ def hop(horizon=2, **options):
     return pusher(horizon=horizon, **options).replace(final_cost={cost})
 """
 PLAIN = "lambda state: {} * state.qpos[0]"
-SLOTTED = """
-class Weights:
-    __slots__ = ("one",)
-    def __init__(self): self.one = data.SCALE
-weights = Weights()
-"""
 CALLED = """
 class Cost:
     def __init__(self): self.by = 1.0
@@ -61,15 +55,6 @@ def cost_with(held):
 TABLE, IN_TABLE, IN_TASK = "TABLE = [data.SCALE]\n", "global TABLE of", "task hopping:hop differs"
 CASES: dict[str, tuple[str, str, str]] = {
     "a global dict": ('TABLE = {"a": data.SCALE}', PLAIN.format('TABLE["a"]'), IN_TABLE),
-    "a dict in a dict": ('TABLE = {"a": {"b": [data.SCALE]}}', PLAIN.format('TABLE["a"]["b"][0]'), IN_TABLE),
-    "a global list": ("LIST = [1.0, data.SCALE]", PLAIN.format("LIST[1]"), "global LIST of"),
-    "a global set": ("SET = {1.0, data.SCALE}", PLAIN.format("max(SET)"), "global SET of"),
-    "a deque": ("LAST = deque([data.SCALE])", PLAIN.format("LAST[0]"), "global LAST of"),
-    "a subclass of dict": (
-        "class Own(dict): pass\nOWN = Own()\nOWN.by = data.SCALE", PLAIN.format("OWN.by"), "global OWN of",
-    ),
-    "a global object": ("class It: pass\nit = It()\nit.by = data.SCALE", PLAIN.format("it.by"), "global it of"),
-    "slots": (SLOTTED, PLAIN.format("weights.one"), "global weights of"),
     "__call__ of a class": (TABLE + CALLED, "Cost()", IN_TABLE),
     "a method": (
         TABLE + "class It:\n    def cost(self, state): return TABLE[0] * state.qpos[0]", "It().cost", IN_TABLE,
@@ -110,10 +95,6 @@ CASES: dict[str, tuple[str, str, str]] = {
         "partial(cost, it)", IN_TASK,
     ),
     "a slice in a closure": (HELD, "cost_with(slice(0, data.COUNT))", IN_TASK),
-    "a range in a closure": (HELD, "cost_with(np.array(range(data.COUNT)))", IN_TASK),
-    "a range itself": (
-        "def cost_with(r): return lambda state: state.qpos[0] * sum(r)", "cost_with(range(data.COUNT))", IN_TASK,
-    ),
     "an attribute of a module": ("", PLAIN.format("data.SCALE"), "global SCALE of data"),
     "an attribute of a function": (
         "def cost(state): return cost.by * state.qpos[0]\ncost.by = data.SCALE", "cost", IN_TASK,
@@ -121,13 +102,6 @@ CASES: dict[str, tuple[str, str, str]] = {
     "a default argument": ("def cost(state, by=[data.SCALE]): return by[0] * state.qpos[0]", "cost", IN_TASK),
     "a function made at run time": (
         "exec(f'def cost(state): return {data.SCALE} * state.qpos[0]')", "cost", "task hopping:hop",
-    ),
-    "an object array": (
-        "ARRAY = np.array([{'a': data.SCALE}], dtype=object)", PLAIN.format("ARRAY[0]['a']"), "global ARRAY of",
-    ),
-    "a random generator": (
-        "DRAWN = np.random.default_rng(int(data.SCALE))", PLAIN.format("DRAWN.bit_generator.state['uinteger']"),
-        "global DRAWN of",
     ),
     "a lazy import": (
         "def cost(state):\n    import lazy\n    return lazy.BY * state.qpos[0]", "cost", "source of lazy.py",
@@ -203,8 +177,6 @@ def test_a_change_is_refused_and_nothing_else(kind: str, tmp_path: Path, world: 
     with pytest.raises(StudyError, match=f"holds another study .*{named}") as refused:
         swept(tmp_path / "out")
     assert "\n" not in str(refused.value)
-    world(1.0)
-    assert swept(tmp_path / "out").attrs["computed_cells"] == 0
 
 
 LATE = """
