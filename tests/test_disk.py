@@ -18,7 +18,7 @@ from tests.documents import cell_arrays, study_document
 from tests.faults import NO_FILES, deadline, every_fault, put_no_file
 from tests.processes import run_script
 
-CELLS = 3
+CELLS = 2
 DOCUMENT = study_document(CELLS)
 
 
@@ -158,10 +158,10 @@ def test_non_regular_files_are_refused_at_once(tmp_path: Path, kind: str) -> Non
         return path.name
 
     with deadline(5):
-        for name, read in (("00001.npz", Store.read), ("00002.part.npz", Store.read_part)):
+        for name, read in (("00001.npz", Store.read), ("00001.part.npz", Store.read_part)):
             replaced(f"cells/{name}")
             with pytest.raises(StudyError, match=f"{name} is damaged .*; move it away to compute it again"):
-                read(Store.open(folder), int(name[4]))
+                read(Store.open(folder), 1)
         replaced("study.lock")
         with pytest.raises(StudyError, match="cannot lock .*study.lock"), Store.open(folder).claims():
             pass
@@ -186,26 +186,16 @@ def test_a_link_for_the_folder_of_cells_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
-    with (tmp_path / "file").open("wb") as file:
+    study(tmp_path)
+    with (tmp_path / "cells" / "00001.npz").open("wb") as file:
         file.truncate(10**12)
-    with pytest.raises(OSError, match="it has 1000000000000 bytes; the limit is 100"):
-        read_whole(tmp_path / "file", most=100)
-    for folder, name in ((tmp_path / "one", "study.json"), (tmp_path / "two", "cells/00001.npz")):
-        study(folder)
-        with (folder / name).open("wb") as file:
-            file.truncate(10**12)
-        with pytest.raises(StudyError, match=f"{Path(name).name}.*it has 1000000000000 bytes"):
-            Store.open(folder).read(1)
+    with pytest.raises(StudyError, match="00001.npz.*it has 1000000000000 bytes"):
+        Store.open(tmp_path).read(1)
 
 
 def test_only_files_made_here_are_removed(tmp_path: Path) -> None:
     """A name that merely looks like a temporary one is somebody else's."""
-    mine = [
-        f".notes{TEMPORARY}",
-        f".old.abcdefgh{TEMPORARY}",
-        f".study.json.{'0' * 12}{'1' * 12}{TEMPORARY}",
-        f"a{TEMPORARY}",
-    ]
+    mine = [f"{name}{TEMPORARY}" for name in (".notes", ".old.abcdefgh", f".study.json.{'0' * 12}{'1' * 12}", "a")]
     for name in mine:
         (tmp_path / name).write_text("mine")
     ours = [temporary_name(name) for name in ("study.json", "00001.npz", "with\nline", "\udcff")]

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 from mjx_study import cli, disk
+from mjx_study.cli import studies
+from mjx_study.execution.run import run_study
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.results.variables import GRADIENTS
 from tests.documents import content, stages_of, stub_cells
@@ -117,6 +119,21 @@ def ended(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     assert error.startswith("mjx-study: cannot write"), told
     assert "No space left on device" in error
     return out
+
+
+def test_a_full_disk_costs_no_number(
+    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is full once the folder is begun."""
+
+    def run(*arguments: Any, **options: Any) -> Any:
+        full()
+        return run_study(*arguments, **options)
+
+    monkeypatch.setattr(studies, "run_study", run)
+    small = "--contact reference --stiffness 10 --horizon 4 --samples 8 --reference-samples 8 --json --output"
+    assert json.loads(ended(capsys, "compare", "pusher", *small.split(), str(tmp_path)))["rows"]
+    assert not list((tmp_path / "cells").iterdir())
 
 
 def test_a_full_disk_is_told_before_anything_is_computed(

@@ -30,8 +30,7 @@ from tests.processes import run_script
 
 TASK = """
 import data, importlib, os
-from collections import deque
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 import jax, jax.numpy as jnp, numpy as np
 from mjx_study.tasks.pusher import pusher
@@ -42,44 +41,33 @@ def hop(horizon=2, **options):
     return pusher(horizon=horizon, **options).replace(final_cost={cost})
 """
 PLAIN = "lambda state: {} * state.qpos[0]"
-CALLED = """
-class Cost:
-    def __init__(self): self.by = 1.0
-    def __call__(self, state): return self.by * TABLE[0] * state.qpos[0]
-"""
 HELD = """
 def cost_with(held):
     def cost(state): return state.qpos[0] * jnp.arange(9.0)[held].sum()
     return cost
 """
 TABLE, IN_TABLE, IN_TASK = "TABLE = [data.SCALE]\n", "global TABLE of", "task hopping:hop differs"
+HEIR = "\nclass Heir(It): pass"
+
+
+def in_class(text: str) -> str:
+    """A class with one method, which reads the table."""
+    return f"{TABLE}class It:\n    {text}"
+
+
 CASES: dict[str, tuple[str, str, str]] = {
     "a global dict": ('TABLE = {"a": data.SCALE}', PLAIN.format('TABLE["a"]'), IN_TABLE),
-    "__call__ of a class": (TABLE + CALLED, "Cost()", IN_TABLE),
-    "a method": (
-        TABLE + "class It:\n    def cost(self, state): return TABLE[0] * state.qpos[0]", "It().cost", IN_TABLE,
-    ),
+    "__call__": (in_class("def __call__(self, state): return TABLE[0] * state.qpos[0]"), "It()", IN_TABLE),
+    "a method": (in_class("def cost(self, state): return TABLE[0] * state.qpos[0]"), "It().cost", IN_TABLE),
     "an attribute of a class": (
         "class It:\n    by = data.SCALE\n    def cost(self, state): return self.by * state.qpos[0]", "It().cost",
         IN_TASK,
     ),
-    "a static method": (
-        TABLE + "class It:\n    @staticmethod\n    def by(): return TABLE[0]", PLAIN.format("It.by()"), IN_TABLE,
-    ),
-    "a class method": (
-        TABLE + "class It:\n    @classmethod\n    def by(cls): return TABLE[0]", PLAIN.format("It.by()"), IN_TABLE,
-    ),
-    "a base class": (
-        TABLE + "class Base:\n    def by(self): return TABLE[0]\nclass It(Base): pass", PLAIN.format("It().by()"),
-        IN_TABLE,
-    ),
-    "a property": (
-        TABLE + "class It:\n    @property\n    def by(self): return TABLE[0]\nit = It()", PLAIN.format("it.by"),
-        IN_TABLE,
-    ),
-    "a helper under jit": (
-        TABLE + "help = jax.jit(lambda x: TABLE[0] * x)", "lambda state: help(state.qpos[0])", IN_TABLE,
-    ),
+    "a static method": (in_class("@staticmethod\n    def by(): return TABLE[0]"), PLAIN.format("It.by()"), IN_TABLE),
+    "a class method": (in_class("@classmethod\n    def by(cls): return TABLE[0]"), PLAIN.format("It.by()"), IN_TABLE),
+    "a base class": (in_class("def by(self): return TABLE[0]") + HEIR, PLAIN.format("Heir().by()"), IN_TABLE),
+    "a property": (in_class("@property\n    def by(self): return TABLE[0]"), PLAIN.format("It().by"), IN_TABLE),
+    "under jit": (TABLE + "help = jax.jit(lambda x: TABLE[0] * x)", "lambda state: help(state.qpos[0])", IN_TABLE),
     "a helper under vmap": (
         "help = jax.vmap(lambda x, y: x + y[0], in_axes=(0, data.AXIS))",
         "lambda state: help(state.qpos, jnp.eye(2))[0] * 1.0", IN_TASK,
@@ -152,11 +140,6 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     yield write
     for name in ("hopping", "data", "lazy", "between"):
         sys.modules.pop(name, None)
-
-
-@pytest.fixture
-def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    stub_cells(monkeypatch, planned_arrays)
 
 
 def swept(folder: Path, task: str = "hopping:hop") -> Any:

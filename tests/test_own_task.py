@@ -148,8 +148,9 @@ def test_a_command_about_it_reports_numbers(command: str, task: str, document) -
 def test_a_policy_that_was_found_is_replayed_and_its_study_drawn(task: str, document) -> None:
     small = "--iterations 2 --samples 4 --seeds 1 --learning-rate 0.1 --estimators fobg --output descent"
     (run,) = document(f"optimise {task} {small}")["runs"]
-    found = document(f"rollout {task} --theta descent/policy-fobg.json --output found --renderer drawing")
+    found = document(f"rollout {task} --theta descent/policy-fobg.json --renderer drawing")
     assert found["theta"] == run["theta"][0] and found["task"] == "cart" and math.isfinite(found["cost"])
+    assert {Path(name).parent for name in found["written"]} == {Path("results/mine-cart-rollout")}
     assert document("plot descent --output drawn")["written"] == ["drawn/descent.png", "drawn/descent.pdf"]
     document("report descent")
     assert f"<h1>{task}: " in Path("descent/report.html").read_text()
@@ -213,15 +214,11 @@ def test_the_current_directory_is_on_the_path_during_the_import_only(write, tmp_
 
 
 def test_no_such_module(write) -> None:
-    write("import nowhere_at_all", "inner")
     told = "module:name of your own, or an MJCF (there is no module 'mine' here or installed)"
     assert refused("mine:hop").endswith(told)
-    assert refused("mine.tasks:hop").endswith("(there is no module 'mine' here or installed)")
     assert refused("ball_wall:dom").startswith("unknown task 'ball_wall:dom'; did you mean ball_wall:dome? (")
     for name in ("mine.py:hop", "folder/mine:hop", ":hop", ".mine:hop"):
         assert refused(name).endswith("is not a module name: write it as in an import, without a folder or .py)")
-    message = "importing inner raised ModuleNotFoundError: No module named 'nowhere_at_all' (inner.py, line 1)"
-    assert refused("inner:hop") == message
 
 
 @pytest.mark.parametrize(
@@ -229,32 +226,23 @@ def test_no_such_module(write) -> None:
     [
         ("x = 1\ny = z", "importing mine raised NameError: name 'z' is not defined (mine.py, line 2)"),
         ("def hop(:", "importing mine raised SyntaxError: invalid syntax (mine.py, line 1)"),
+        ("import nowhere", "importing mine raised ModuleNotFoundError: No module named 'nowhere' (mine.py, line 1)"),
         ("raise SystemExit", "importing mine raised SystemExit (mine.py, line 1)"),
         ("raise ValueError('two\\nlines')", "importing mine raised ValueError: two lines (mine.py, line 1)"),
         ("", "mine has no 'hop'; it has no task"),
         ("from math import pi\ndef hip(): ...", "mine has no 'hop'; it has hip"),
         ("hop = 3", "mine:hop is neither a Task nor a function that returns one, but of type int"),
-        ("def hop(): ...", "mine:hop returned an object of type NoneType instead of a Task"),
-        ("def hop():\n  return 1 / 0", "mine:hop raised ZeroDivisionError: division by zero (mine.py, line 2)"),
-        ("def hop(kind): ...", "mine:hop does not take the options given (missing a required argument: 'kind')"),
-        ("import mjx_study as m\ndef hop(): m.load_scene('a.xml')", "mine:hop raised SceneError: no MJCF file at a."),
+        ("def hop(**_): ...", "mine:hop returned an object of type NoneType instead of a Task"),
+        ("def hop(horizon):\n  return 1 / 0", "mine:hop raised ZeroDivisionError: division by zero (mine.py, line 2)"),
+        ("def hop(kind, horizon): ...", "mine:hop does not take the options given (missing a required argument: 'k"),
+        ("def hop(): ...", "mine:hop does not take the options given (got an unexpected keyword argument 'horizon')"),
+        ("import mjx_study as m\ndef hop(horizon): m.load_scene('a.xml')", "mine:hop raised SceneError: no MJCF file "),
+        (f"{TINY}\nhop = hop()", "mine:hop is a ready-made Task, which horizon cannot change"),
     ],
 )
 def test_what_is_no_task(source: str, says: str, write) -> None:
     write(source)
-    assert refused("mine:hop").startswith(says)
-
-
-def test_options_that_a_function_does_not_take(write) -> None:
-    write("def hop(horizon): ...\ndef hip(*, cone=None, **rest): return rest")
-    assert "(got an unexpected keyword argument 'cone')" in refused("mine:hop", horizon=3, cone="elliptic")
-    assert refused("mine:hip", horizon=3).endswith("an object of type dict instead of a Task")
-
-
-def test_a_task_takes_no_options(write) -> None:
-    write(TINY + "\nmade = hop()\n")
-    message = refused("mine:made", horizon=3, cone="elliptic")
-    assert message.startswith("mine:made is a ready-made Task, which horizon and cone cannot change")
+    assert refused("mine:hop", horizon=3).startswith(says)
 
 
 @pytest.mark.parametrize(
