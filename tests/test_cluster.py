@@ -173,17 +173,14 @@ def test_the_example_files_are_sound() -> None:
     assert "dask worker tcp://there:8786" in script.replace("python -m distributed.cli.dask_worker", "dask worker")
     assert "--nthreads 1 " in script and "--nworkers 4 " in script
     assert "source /shared/mjx-study/.venv/bin/activate" in script
-    objects = {(part["kind"], part["metadata"]["name"]): part["spec"] for part in parts(files / "kubernetes.yaml")}
+    parts = yaml.safe_load_all((files / "kubernetes.yaml").read_text())
+    objects = {(part["kind"], part["metadata"]["name"]): part["spec"] for part in parts}
     (client,) = objects["Job", "sweep"]["template"]["spec"]["containers"]
     options = cli.parser().parse_args(client["command"][1:])
     assert options.cluster == "tcp://scheduler:8786" and ("Service", "scheduler") in objects
     for name in ("scheduler", "worker"):
         deployment = objects["Deployment", name]
         assert deployment["selector"]["matchLabels"] == deployment["template"]["metadata"]["labels"]
-
-
-def parts(path: Path) -> list[dict[str, Any]]:
-    return list(yaml.safe_load_all(path.read_text()))
 
 
 def sweep(folder: Path, address: str = "local:2", cells: str = "", **variables: str) -> subprocess.Popen[str]:

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -67,11 +68,7 @@ def studies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture
 def copy(studies: dict[str, Path], tmp_path: Path, name: str) -> Path:
     """A copy of one of the folders."""
-    for path, written in content(studies[name]).items():
-        target = tmp_path / "copy" / path.relative_to(studies[name])
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(written)
-    return tmp_path / "copy"
+    return Path(shutil.copytree(studies[name], tmp_path / "copy"))
 
 
 @each_kind

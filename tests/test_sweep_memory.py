@@ -45,14 +45,8 @@ class Stub(Simulator):
 
 
 def config(**changes: Any) -> StudyConfig:
-    common: dict[str, Any] = {
-        "contact": ("penalty",),
-        "stiffness": (10.0,),
-        "reference_samples": 9,
-        "horizon": 3,
-        "chunk_size": 8,
-    }
-    return StudyConfig(tasks=("pusher",), **(common | changes))
+    common: dict[str, Any] = {"contact": ("penalty",), "stiffness": (10.0,), "reference_samples": 9, "horizon": 3}
+    return StudyConfig(tasks=("pusher",), chunk_size=8, **(common | changes))
 
 
 def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,10 +94,8 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
 """
 GROWING: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "seeds": ({"samples": (10_000,), "horizon": 200}, {"seeds": 2}, {"seeds": 8}),
-    "samples": (
-        {"block_size": 10_000, "seeds": 1, "horizon": 50}, {"samples": (40_000,)}, {"samples": (160_000,)},
-    ),
-}  # fmt: skip
+    "samples": ({"block_size": 10_000, "seeds": 1, "horizon": 50}, {"samples": (40_000,)}, {"samples": (160_000,)}),
+}
 """By what grows: the rest of the study, a small one and a large one."""
 
 
@@ -112,9 +104,7 @@ GROWING: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
 def test_memory_does_not_grow(name: str) -> None:
     """With seeds it is what the plan says; with samples in blocks, a fraction of what whole batches would take."""
     common, *sizes = GROWING[name]
-    peak = []
-    for size in sizes:
-        peak.append(float(run_script(PEAK, repr(common | size)).stdout))
+    peak = [float(run_script(PEAK, repr(common | size)).stdout) for size in sizes]
     planned = plan_study(config(**(common | sizes[name == "samples"] | {"block_size": None}))).memory / 1e9
     assert peak[1] < 1.15 * peak[0] + 0.01, peak
     assert planned / 2 < peak[1] < 2 * planned if name == "seeds" else peak[1] < planned / 4, (peak, planned)
