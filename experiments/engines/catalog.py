@@ -93,14 +93,7 @@ ENGINES: Final = {
         f"newton_{name}": Engine(f"Newton 1.8.0, {name}", "newton", "newton_warp", name, "Warp's tape", single=True)
         for name in ("semi_implicit",)
     },
-    "newton_1_0": Engine(
-        "Newton 1.0.0, semi_implicit",
-        "newton_1_0",
-        "newton_warp",
-        "old",
-        "Warp's tape",
-        single=True,
-    ),
+    "newton_1_0": Engine("Newton 1.0.0, semi_implicit", "newton_1_0", "newton_warp", "old", "Warp's tape", single=True),
     "jaxsim": Engine("JaxSim 0.9.0, soft", "jaxsim", "jaxsim_soft", "SemiImplicitEuler", "reverse mode"),
     **{
         f"drake_{name}": Engine(f"Drake 1.58.0, {name}", "drake", "drake_plant", name, "AutoDiffXd")

@@ -26,13 +26,7 @@ from mjx_study.gradcheck import gradcheck, plan_gradcheck
 from mjx_study.objective import Simulator, compiled_rollout
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.rows import rows_of
-from mjx_study.simulation.contact import (
-    ContactModel,
-    apply_contact,
-    cone_edges,
-    family_model,
-    stiffness_from_solref,
-)
+from mjx_study.simulation.contact import ContactModel, apply_contact, cone_edges, family_model, stiffness_from_solref
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.law import make_law
