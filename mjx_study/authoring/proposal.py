@@ -12,6 +12,7 @@ from mjx_study.authoring.aim import Aim, choose_aim, rounded
 from mjx_study.authoring.trial import MOST_TRIED, SECONDS, Drive, Touch, Trial, moments_of, run_trial, start_of
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.scene import Scene
+from mjx_study.table import grouped
 
 TRIALS: Final = 16
 """Test rollouts with noise, and as many with held controls."""
@@ -172,18 +173,13 @@ def _trials(drive: Drive, steps: int) -> tuple[list[Trial], list[Trial]]:
 
 def _touches(trials: Sequence[Trial], steps: int) -> tuple[dict[tuple[int, int], Touch], dict[tuple[int, int], float]]:
     """Contacts within the horizon of any rollout: the earliest and deepest, and the share of rollouts."""
-    found: dict[tuple[int, int], Touch] = {}
-    counts: dict[tuple[int, int], int] = {}
-    for trial in trials:
-        for pair, touch in trial.touches.items():
-            if touch.first >= steps:
-                continue
-            counts[pair] = counts.get(pair, 0) + 1
-            known = found.setdefault(pair, dataclasses.replace(touch))
-            known.depth = max(known.depth, touch.depth)
-            if touch.first < known.first:
-                known.first, known.speed = touch.first, touch.speed
-    return found, {pair: count / len(trials) for pair, count in counts.items()}
+    every = [(pair, touch) for trial in trials for pair, touch in trial.touches.items() if touch.first < steps]
+    found, shares = {}, {}
+    for pair, alike in grouped(every, lambda each: each[0]).items():
+        earliest = min((touch for _, touch in alike), key=lambda touch: touch.first)
+        found[pair] = dataclasses.replace(earliest, depth=max(touch.depth for _, touch in alike))
+        shares[pair] = len(alike) / len(trials)
+    return found, shares
 
 
 def _pair(scene: Scene, aim: Aim, touches: dict[tuple[int, int], Touch]) -> tuple[str, str] | None:

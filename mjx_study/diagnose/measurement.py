@@ -134,13 +134,10 @@ class Measurement:
     @property
     def _slope(self) -> tuple[float, float]:
         """Slope along a path and its standard error, from those of the integrated mean and of the gap."""
-        errors = [(math.hypot(each.off_error, math.sqrt(each.variance / self.samples)), each) for each in self._derived]
+        checked = [each for each in self.estimators if each.paths]
+        errors = [(math.hypot(each.off_error, math.sqrt(each.variance / self.samples)), each) for each in checked]
         error, known = min(errors, key=lambda each: each[0], default=(math.inf, None))
         return (known.slope, error) if known else (0.0, error)
-
-    @property
-    def _derived(self) -> list[Measured]:
-        return [each for each in self.estimators if each.paths]
 
     @property
     def norm(self) -> float:
@@ -166,10 +163,6 @@ class Measurement:
         resolving = [] if self.resolved or not self.norm else [(RESOLVED_SE * self.norm_error / self.norm) ** 2]
         rivals = [each for each in self.estimators if each.error(1.0, bias=0.0) <= self.best.error(1.0)]
         return resolving + [each.more_samples() for each in rivals if each.verdict == "undecided"]
-
-    def time_of(self, samples: float) -> float:
-        """Time of as many samples and checks of the means with them [s]."""
-        return self.seconds * samples / self.samples
 
     @property
     def samples_needed(self) -> float:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from mjx_study.gradcheck.coverage import OPTIONAL, Coverage, count_coverage, exercised, possible
+from mjx_study.gradcheck.engine_step import forward
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.engine import HostState, converged_host, host_data, host_state
 from mjx_study.simulation.scene import Scene
@@ -73,11 +74,14 @@ def states_of(
     parts, unreachable = possible(scene, host)
     start = start_of(scene) if visited is None else visited[0]
     at_rest = ", at rest" if visited is None and not start.qvel.any() else ""
-    first = Sample(f"start{at_rest}", 0, start, _parts(host, start))
+    first = Sample(f"start{at_rest}", 0, start, exercised(forward(host, start)))
     if visited is None:
         rollout = list(_rollout(host, _stirred(host, start, random, SPEED, CONTROL), horizon))
     else:
-        rollout = [Sample(f"step {index}", index, state, _parts(host, state)) for index, state in enumerate(visited)]
+        rollout = [
+            Sample(f"step {index}", index, state, exercised(forward(host, state)))
+            for index, state in enumerate(visited)
+        ]
     chosen = _cover([first], rollout[1:], parts - OPTIONAL, count)
     chosen = _cover(chosen, _elsewhere(host, start, horizon, random), parts - OPTIONAL, count)
     rest = [sample for sample in rollout[1:] if sample not in chosen]
@@ -138,12 +142,6 @@ def _rollout(
         if not np.all(np.isfinite(data.qpos)) or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
             return
         yield Sample(f"step {index}{label}", index, before, exercised(data))
-
-
-def _parts(host: mujoco.MjModel, state: HostState) -> frozenset[str]:
-    data = host_data(host, state)
-    mujoco.mj_forward(host, data)
-    return exercised(data)
 
 
 def _stirred(
