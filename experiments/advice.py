@@ -54,23 +54,17 @@ CONTACTS: Final = {
 }
 LATER: Final = ("sled", "edge", "stops", "hull", "arm", "slope", "margin")
 """Models that were added after all rules had been made, with half of the contacts."""
-LIMITS: Final = ("pendulum", "stops")
-"""Models whose joints reach their limits, without contact."""
-FINE: Final = ("cart", "balls")
-"""Models that are also run at half the timestep, with the default contact."""
+LIMITS: Final = ("pendulum", "stops")  # models whose joints reach their limits, without contact
+FINE: Final = ("cart", "balls")  # models that are also run at half the timestep, with the default contact
 HORIZON: Final = 80
-SAMPLES: Final = 300
-"""Samples per batch of a diagnosis."""
-TOTAL: Final = 20_000
-"""Samples per estimator in the independent measurement."""
-SIZES: Final = (20, 200)
-"""Smallest and largest batch size in the independent measurement."""
+SAMPLES: Final = 300  # samples per batch of a diagnosis
+TOTAL: Final = 20_000  # samples per estimator in the independent measurement
+SIZES: Final = (20, 200)  # smallest and largest batch size in the independent measurement
 PARTS: Final = (8_000, 100, 500)
 """Pairs of rollouts of the reference, and numbers of samples for its control variates."""
 FACTOR: Final = 2.0
 DRAWS: Final = 1000
-SEEDS: Final = (0, 1)
-"""Seeds of the diagnosis and of the independent measurement."""
+SEEDS: Final = (0, 1)  # seeds of the diagnosis and of the independent measurement
 
 
 @dataclasses.dataclass(frozen=True)

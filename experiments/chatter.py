@@ -28,8 +28,7 @@ from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
-SLOTS: Final = 192
-"""Slots for events here, so that all get a term."""
+SLOTS: Final = 192  # slots for events here, so that all get a term
 KINDS: Final = {"none": ("none", 0.0), "all": ("linear", 0.0), "chosen": ("linear", touch.CHATTER)}
 """Terms by name: the kind of onset, and the time between events below which contacts chatter."""
 

@@ -40,10 +40,8 @@ RESULTS: Final = DATA / "native.jsonl"
 TASKS: Final = ("pusher", "sliding_box", "ball_wall", "momentum_transfer", "tennis", "gripper", "landing")
 KINDS: Final = {"value": "rollouts", "gradient": "gradients", "corrected": "corrected gradients"}
 SAMPLES: Final = {"cpu": 1000, "gpu": 98_304}
-ROUTES: Final = {"native": "1", "NumPy": "0", "XLA": "xla"}
-"""Settings of `SWITCH`."""
-MOST_SECONDS: Final = 300
-"""Maximum time for a route."""
+ROUTES: Final = {"native": "1", "NumPy": "0", "XLA": "xla"}  # settings of `SWITCH`
+MOST_SECONDS: Final = 300  # maximum time for a route
 REPEATS: Final = 7
 
 

@@ -59,11 +59,9 @@ COLUMNS: Final = {
     ("engine", "rollouts"): ("C engine", "rollouts"),
     ("engine", "gradients"): ("C engine", "gradients by differences"),
 }
-BUDGET: Final = (100, 50)
-"""Iterations of the solver and of its line search."""
+BUDGET: Final = (100, 50)  # iterations of the solver and of its line search
 SAMPLES: Final = {"cpu": 256, "gpu": 16_384}
-MOST_SECONDS: Final = 900
-"""Maximum time for a route."""
+MOST_SECONDS: Final = 900  # maximum time for a route
 REPEATS: Final = 7
 
 

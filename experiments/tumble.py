@@ -40,10 +40,8 @@ CASES: Final = (
 )
 """Environments, numbers of their steps, and parts into which each timestep of their simulation is divided."""
 SAMPLES: Final = 2000
-PAIRS: Final = 8000
-"""Pairs of rollouts behind a slope."""
-STARTS: Final = 4096
-"""Initial states to draw from."""
+PAIRS: Final = 8000  # pairs of rollouts behind a slope
+STARTS: Final = 4096  # initial states to draw from
 RESULTS: Final = DATA / "tumble.jsonl"
 
 

@@ -34,11 +34,9 @@ from mjx_study.table import markdown_table
 RESULTS: Final = DATA / "values.jsonl"
 SAMPLES: Final = 16
 PATH: Final = 100
-LATEST: Final = 400
-"""Steps of the C engine before a state, at most."""
+LATEST: Final = 400  # steps of the C engine before a state, at most
 INPUTS: Final = "qpos", "qvel", "act", "ctrl"
-DIFFERENCES: Final = 1e-5, 1e-6, 1e-7
-"""Steps of central differences, the best of which counts."""
+DIFFERENCES: Final = 1e-5, 1e-6, 1e-7  # steps of central differences, the best of which counts
 LEFT_OUT: Final = {*(f"humanoid/{count:02}_humanoids" for count in range(2, 11)), "ray", "actuator/general_dyntype"}
 """Copies of a body, a model without a coordinate, and one with a singular inertia matrix."""
 MODELS: Final[dict[str, Path]] = {
@@ -50,8 +48,7 @@ MODELS: Final[dict[str, Path]] = {
         if (name := str(path.relative_to(TESTED).with_suffix(""))) not in LEFT_OUT and path not in ROBOTS.values()
     },
 }
-EDGES: Final = "barkour_v0, exact edges"
-"""That model with the closest points of edges computed without MJX's 1e-6."""
+EDGES: Final = "barkour_v0, exact edges"  # that model with the closest points of edges computed without MJX's 1e-6
 PAIRS: Final = "ours - stock", "ours - engine", "stock - engine"
 HEADINGS: Final = (
     *("model", "DoF", "native - stock", "native - C", "stock - C"),

@@ -32,10 +32,8 @@ POINTS: Final = 16_000
 WORST, PARTS, AROUND = 64, 4, 7
 """Intervals of the grid that are searched for jumps, those across which the cost changes most unlike as across the
 median one around; and parts into which each is split in one call."""
-STEEP, NARROW = 1e-6, 1e-9
-"""Widths of what counts as steep and as a jump [rad]."""
-APART: Final = 1e-6
-"""Distance from which paths have parted [m, rad]."""
+STEEP, NARROW = 1e-6, 1e-9  # widths of what counts as steep and as a jump [rad]
+APART: Final = 1e-6  # distance from which paths have parted [m, rad]
 Intervals = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]
 """Both ends [rad], and the costs there."""
 

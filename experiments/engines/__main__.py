@@ -32,12 +32,10 @@ from experiments.engines.page import CELLS, CHECKS, PAGE, cells, tables
 from experiments.engines.scenes import SCENES, TIMESTEPS, VARIANTS
 from experiments.pages import write_tables
 
-LIMIT: Final = 900.0
-"""Seconds that a cell may take if `--limit` gives no others."""
+LIMIT: Final = 900.0  # seconds that a cell may take if `--limit` gives no others
 ONE_CORE: Final = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
 """Of cells of which several are measured at a time."""
-TRIAL: Final = ("toss",)
-"""Scenes of `--quick`."""
+TRIAL: Final = ("toss",)  # scenes of `--quick`
 HALF, HIGH = VARIANTS
 CHECKED: Final = (
     *itertools.product(("mjx", "brax_positional", "drake_sap"), (HALF,), TIMESTEPS),

@@ -7,8 +7,7 @@ from typing import Final
 
 from experiments import ROOT
 
-HOME: Final = ROOT / "build" / "engines"
-"""Environments, one folder each; in none of them is this project installed."""
+HOME: Final = ROOT / "build" / "engines"  # environments, one folder each; in none of them is this project installed
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,10 +14,8 @@ from experiments.engines.scenes import SCENES, TIMESTEPS, scene_named
 from experiments.pages import markdown_row
 
 CELLS: Final = DATA / "engines.jsonl"
-CHECKS: Final = DATA / "engines_checks.jsonl"
-"""Cells of variants of the scenes."""
-TRIAL: Final = DATA / "engines_trial.jsonl"
-"""Seconds that cells of `--quick` took."""
+CHECKS: Final = DATA / "engines_checks.jsonl"  # cells of variants of the scenes
+TRIAL: Final = DATA / "engines_trial.jsonl"  # seconds that cells of `--quick` took
 PAGE: Final = DOCS / "engines.md"
 Cells = Mapping[tuple[str, str, float], Mapping[str, Any]]
 

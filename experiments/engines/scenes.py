@@ -11,8 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 GRAVITY: Final = 9.81
-RADIUS: Final = 0.1
-"""Radius of spheres, and half edge of boxes [m]."""
+RADIUS: Final = 0.1  # radius of spheres, and half edge of boxes [m]
 LENGTH, LIMIT, PIVOT = 0.5, 0.5, 2.0
 """The pendulum's length [m], the angle of its limit from below [rad], the height of its hinge [m]."""
 

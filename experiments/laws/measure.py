@@ -34,13 +34,10 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.task import Task
 
-POINTS, CHUNK = 4000, 250
-"""Points, samples and pairs; samples per call."""
-MANY_JOINTS: Final = 10
-"""Degrees of freedom from which a quarter of the points must do."""
+POINTS, CHUNK = 4000, 250  # points, samples and pairs; samples per call
+MANY_JOINTS: Final = 10  # degrees of freedom from which a quarter of the points must do
 GRAVITY, FINE = 9.81, 0.002  # [m/s^2], [s]
-SLOPE: Final = 0.5
-"""Of the ground on which a ball of friction 1 rests."""
+SLOPE: Final = 0.5  # of the ground on which a ball of friction 1 rests
 STEPS: Final = (0.001, 0.002, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08)
 STIFF, SHORT = (0.001, 1.0), 1e-4  # solref and [s] of `RIGID`
 SAMPLED: Final = ("pusher", "tennis", "landing")
@@ -49,8 +46,7 @@ TRAINED: Final[dict[str, dict[str, Any]]] = {
     "ball_wall": {"iterations": 40, "samples": (30,), "learning_rate": 1.0},
 }
 SEEDS, DRAWS = 3, 1000
-BATCH: Final = 1000
-"""Samples, and pairs of rollouts of the reference, of `compared`."""
+BATCH: Final = 1000  # samples, and pairs of rollouts of the reference, of `compared`
 AFLOAT: Final = 300
 DURATION, NARROW = 0.8, 1e-6  # [s], [rad]
 

@@ -30,8 +30,7 @@ TOSSES: Final = tuple(
     for step in (("5", "2", "0.5") if row not in OTHERS else ("5", "2"))
 )
 """Scene and row of the lines of the table `toss`."""
-RIGID: Final = "rigid"
-"""In place of a law: the C engine's limit of stiff contact and short steps."""
+RIGID: Final = "rigid"  # in place of a law: the C engine's limit of stiff contact and short steps
 ZEROTH: Final = "MuJoCo's default, zeroth order"
 LONGER: Final = {
     "the same, 5 x the iterations": (*LAWS["MuJoCo's default"], "zobg", 5),

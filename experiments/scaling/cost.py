@@ -22,8 +22,7 @@ from mjx_study.tasks.task import Task
 
 KINDS: Final = ("value", "gradient")
 REPEATS: Final = 7
-LIMIT: Final = 6.0
-"""Seconds after which a measurement is not repeated."""
+LIMIT: Final = 6.0  # seconds after which a measurement is not repeated
 BASE: Final = "pusher"
 HORIZON: Final = 20
 SPREAD_HORIZON: Final = 200

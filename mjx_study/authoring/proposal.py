@@ -14,25 +14,18 @@ from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.scene import Scene
 from mjx_study.table import grouped
 
-TRIALS: Final = 16
-"""Test rollouts with noise, and as many with held controls."""
-NOISE: Final = 0.1
-"""Noise: share of half a control's range or of its substitute, or [m/s, rad/s] of velocities."""
-LIFTING: Final = 2.0
-"""Half range of a motor that has none, in controls that hold the model against gravity."""
-HELD: Final = 10
-"""Largest held change, in standard deviations of the noise: the whole range of a control."""
-USUAL: Final = 0.5
-"""Shortest duration of a rollout, if `MOST` steps allow it [s]."""
-FEWEST, MOST = 20, 300
-"""Numbers of steps of a rollout."""
+TRIALS: Final = 16  # test rollouts with noise, and as many with held controls
+NOISE: Final = 0.1  # share of half a control's range or of its substitute, or [m/s, rad/s] of velocities
+LIFTING: Final = 2.0  # half range of a motor that has none, in controls that hold the model against gravity
+HELD: Final = 10  # largest held change, in standard deviations of the noise: the whole range of a control
+USUAL: Final = 0.5  # shortest duration of a rollout, if `MOST` steps allow it [s]
+FEWEST, MOST = 20, 300  # numbers of steps of a rollout
 SINKING: Final = 0.2
 """Greatest depth of a contact at the lowest stiffness, as a share of the smaller geom's least half size."""
 RESOLVED: Final = 0.5
 """h sqrt(K / m) at the highest stiffness: 13 steps in a contact's period; a critically damped one is stable to 0.83."""
 STIFFNESSES: Final = 4
-WEIGHT: Final = 0.01
-"""Cost of holding all controls at their largest change."""
+WEIGHT: Final = 0.01  # cost of holding all controls at their largest change
 ITERATIONS, SAMPLES = 100, 20
 PACE: Final = 0.3
 """Learning rate of Adam, in standard deviations of the noise: about the most that it moves a parameter in an iteration,

@@ -11,10 +11,8 @@ from jaxtyping import Float
 from mjx_study.limits import LARGEST_COORDINATE
 from mjx_study.simulation.engine import approach_speed, quiet_engine
 
-SECONDS: Final = 2.0
-"""Longest test rollout [s]."""
-MOST_TRIED: Final = 2000
-"""Maximum number of steps of a test rollout."""
+SECONDS: Final = 2.0  # longest test rollout [s]
+MOST_TRIED: Final = 2000  # maximum number of steps of a test rollout
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -39,10 +39,8 @@ FAMILIES: Final = (
 """Columns of the verdict matrix."""
 REAL: Final = FAMILIES[1 : FAMILIES.index("mjcf")]
 """MJX contact families to compare; "mjcf" is for systems without contact."""
-TIMED: Final = 64
-"""Samples per device in a timed batch."""
-REPEATS: Final = 12
-"""Repetitions of a timing."""
+TIMED: Final = 64  # samples per device in a timed batch
+REPEATS: Final = 12  # repetitions of a timing
 RELAXATIONS: Final = {
     "smooth onset": ("smooth_onset", 1.0, None),
     "ten times softer": ("mujoco", 0.1, None),

@@ -25,8 +25,7 @@ from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.law import installed
 
-ALPHA: Final = 0.05
-"""Probability that any interval of a ledger misses its value."""
+ALPHA: Final = 0.05  # probability that any interval of a ledger misses its value
 
 
 def interval_of(statistic: Statistic, level: float) -> Range:

@@ -30,23 +30,16 @@ from mjx_study.simulation.scene import num_constraint_rows
 from mjx_study.tasks.task import Task
 
 ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
-SAMPLES: Final = 500
-"""Samples per batch, if time allows."""
-BUDGET_SECONDS: Final = 30.0
-"""Time for all batches, compilation excluded [s]."""
+SAMPLES: Final = 500  # samples per batch, if time allows
+BUDGET_SECONDS: Final = 30.0  # time for all batches, compilation excluded [s]
 LARGE_CHUNK: Final = 8
 """Samples per program call on a CPU for large models: a call takes the time of all of them, however few are
 requested. Small ones share the programs of studies."""
-SMALL_MODEL: Final = (8, 32)
-"""Maximum numbers of degrees of freedom and constraint rows of a small model."""
-RESOLVED_SE: Final = 2.0
-"""Standard errors beyond which a gradient is distinguishable from 0."""
-INTERVAL_SE: Final = 1.96
-"""Half-width of a 95 % interval in standard errors."""
-MOST_SAMPLES: Final = 16 * SAMPLES
-"""Number of samples beyond which no more are drawn without being asked for."""
-TARGET_ERROR: Final = 0.1
-"""Relative error for which the page states a number of samples."""
+SMALL_MODEL: Final = (8, 32)  # maximum numbers of degrees of freedom and constraint rows of a small model
+RESOLVED_SE: Final = 2.0  # standard errors beyond which a gradient is distinguishable from 0
+INTERVAL_SE: Final = 1.96  # half-width of a 95 % interval in standard errors
+MOST_SAMPLES: Final = 16 * SAMPLES  # number of samples beyond which no more are drawn without being asked for
+TARGET_ERROR: Final = 0.1  # relative error for which the page states a number of samples
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,12 +17,9 @@ from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
-STATES: Final = 2
-"""Number of states in the gradient check."""
-PARTS: Final = ("rollout without noise", "derivatives of steps", "estimators")
-"""Names of the parts in progress."""
-ONE_DIGIT_UNCERTAINTY: Final = 0.5
-"""Relative standard error beyond which an error is shown with one digit."""
+STATES: Final = 2  # number of states in the gradient check
+PARTS: Final = ("rollout without noise", "derivatives of steps", "estimators")  # names of the parts in progress
+ONE_DIGIT_UNCERTAINTY: Final = 0.5  # relative standard error beyond which an error is shown with one digit
 
 
 @dataclasses.dataclass(frozen=True)

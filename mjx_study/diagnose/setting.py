@@ -19,10 +19,8 @@ from mjx_study.simulation.engine import approach_speed, engine_model
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
-EVENTS: Final = 50
-"""Number of rollouts with noise in which contacts are counted under a law other than MuJoCo's."""
-FASTEST: Final = 10.0
-"""Closing speed up to which contacts are found under a law that acts before touch [m/s]."""
+EVENTS: Final = 50  # number of rollouts with noise in which contacts are counted under a law other than MuJoCo's
+FASTEST: Final = 10.0  # closing speed up to which contacts are found under a law that acts before touch [m/s]
 FOREIGN: Final = {"damping": None, "stiffness": None, "travel": None, "impedance": None, "jump": 0.0, "stable": True}
 """What a contact under a law other than MuJoCo's has in place of MuJoCo's numbers."""
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)

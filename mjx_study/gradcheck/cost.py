@@ -19,14 +19,11 @@ from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
 DIRECTIONS: Final = 6
-BATCH: Final = 8
-"""Rollouts per call of the cost program."""
+BATCH: Final = 8  # rollouts per call of the cost program
 DIFFERENCE_TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-9
-CLOSED_FORM_TOLERANCE: Final = 1e-3
-"""Relative distance from the closed form's gradient that counts as agreement."""
-MAX_GROWTH: Final = 2.0
-"""Allowed growth of the distance with stiffness, which should bring the two models together."""
+CLOSED_FORM_TOLERANCE: Final = 1e-3  # relative distance from the closed form's gradient that counts as agreement
+MAX_GROWTH: Final = 2.0  # allowed growth of the distance with stiffness, which should bring the two models together
 
 
 class CostPrograms:

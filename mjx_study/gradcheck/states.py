@@ -17,20 +17,14 @@ from mjx_study.simulation.scene import Scene
 
 SPEED: Final = 0.1
 """Standard deviation of sampled initial velocities [m/s or rad/s]: small, but nothing is at rest or at a tie."""
-FASTER: Final = (1.0, 5.0)
-"""Standard deviations in rollouts that search for parts the first did not reach."""
-PUSHES: Final = 10
-"""Number of times that new velocities and controls are drawn in such a rollout."""
+FASTER: Final = (1.0, 5.0)  # standard deviations in rollouts that search for parts the first did not reach
+PUSHES: Final = 10  # number of times that new velocities and controls are drawn in such a rollout
 CONTROL: Final = 0.3
 """Standard deviation of sampled controls, relative to half their range; absolute for unlimited controls."""
-POSES: Final = 30
-"""Number of random poses tried for parts that no rollout reached."""
-FALL: Final = 50
-"""Number of steps of the rollout from each pose."""
-MAX_EXCESS: Final = 0.01
-"""Largest excess of a pose beyond a limit, relative to the range."""
-LOOK: Final = 200
-"""Number of states searched at once for one that exercises a missing part."""
+POSES: Final = 30  # number of random poses tried for parts that no rollout reached
+FALL: Final = 50  # number of steps of the rollout from each pose
+MAX_EXCESS: Final = 0.01  # largest excess of a pose beyond a limit, relative to the range
+LOOK: Final = 200  # number of states searched at once for one that exercises a missing part
 
 _SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 

@@ -8,8 +8,7 @@ from typing import Any, Final
 from experiments.engines.adapters.jax_common import batched
 from experiments.engines.scenes import Scene, Simulate, mjcf, mjcf_index, mjcf_state
 
-SPIN = 1e-6
-"""Angular velocity of every body at the start of `generalized` [rad/s], whose derivative at rest is NaN."""
+SPIN = 1e-6  # angular velocity of every body at the start of `generalized` [rad/s], whose derivative at rest is NaN
 
 
 def short_steps(objective: Callable[[Any], Any], projection: Any, **options: Any) -> Any:

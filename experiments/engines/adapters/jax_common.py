@@ -8,8 +8,7 @@ import numpy as np
 
 from experiments.engines.scenes import Rollout, Scene, Simulate
 
-CHUNK = 100
-"""Parameters per call of the program."""
+CHUNK = 100  # parameters per call of the program
 
 
 def batched(scene: Scene, final_positions: Callable[[Any, Any], Any], *, forward: bool = False) -> Simulate:

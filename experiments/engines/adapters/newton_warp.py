@@ -14,14 +14,12 @@ import numpy as np
 
 from experiments.engines.scenes import LENGTH, LIMIT, PIVOT, RADIUS, Rollout, Scene, Simulate
 
-WORLDS = 100
-"""Rollouts that are simulated at once."""
+WORLDS = 100  # rollouts that are simulated at once
 GAIN = 50.0
 """Friction per slip speed [N s/m]: a sphere's contact has an effective mass of 2/7 kg, and steps of 5 ms bear 114."""
 STIFFNESS, DAMPING = 2500.0, 100.0
 """Newton's defaults [N/m, N s/m]."""
-BOB = 0.05
-"""Radius of the pendulum's ball [m], as in MuJoCo's model."""
+BOB = 0.05  # radius of the pendulum's ball [m], as in MuJoCo's model
 
 
 def add_pendulum(wp: Any, newton: Any, world: Any) -> None:

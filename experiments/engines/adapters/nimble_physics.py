@@ -7,12 +7,9 @@ import numpy as np
 
 from experiments.engines.scenes import LENGTH, LIMIT, PIVOT, RADIUS, CannotError, Rollout, Scene, Simulate
 
-UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""From the scene's axes to the engine's."""
-THICK = 1.0
-"""Half thickness of floor and wall, which are boxes [m]."""
-SPREAD = 0.4 * 0.05**2
-"""Moment of inertia of the pendulum's ball about its center, as in MuJoCo's model [kg m^2]."""
+UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from the scene's axes to the engine's
+THICK = 1.0  # half thickness of floor and wall, which are boxes [m]
+SPREAD = 0.4 * 0.05**2  # moment of inertia of the pendulum's ball about its center, as in MuJoCo's model [kg m^2]
 
 
 def build(scene: Scene, timestep: float, variant: str) -> Simulate:
