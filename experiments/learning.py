@@ -34,7 +34,7 @@ import mjx_study
 from estimators import Differentiation, Estimator, Evaluation, GradientEstimate, make_estimator, noise
 from estimators.interpolation import apply_choice, constrained_alpha
 from estimators.sampling import draw
-from experiments import DOCS
+from experiments import DOCS, read_lines
 from experiments.figures.rollouts import INK
 from experiments.pages import DPI, write_tables
 from mjx_study.objective.cost import before_each_step, last_of, rollout_cost
@@ -413,7 +413,7 @@ def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:
 
 def report(path: str) -> None:
     """Write the tables of docs/robots.md and its figure."""
-    lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
+    lines = read_lines(Path(path))
     tables = {name: table(lines, name) for name in TASKS}
     write_tables(DOCS / "robots.md", tables | {f"{name}, grid": grid_table(lines, name) for name in TASKS})
     figure(lines).savefig(DOCS / "learning.png")
@@ -423,8 +423,7 @@ def main(what: str, name: str, method: str, *arguments: str) -> None:
     """Compute one line of the results, and print it."""
     mjx_study.configure()
     if what == "learn":
-        lines = [json.loads(line) for line in Path(arguments[0]).read_text().splitlines()]
-        found = learn(name, method, *best(lines, name, method))
+        found = learn(name, method, *best(read_lines(Path(arguments[0])), name, method))
     else:
         found = {"tune": tune, "spread": spread, "ppo": lambda name, method, *rest: proximal(name, *rest)}[what](
             name, method, *map(json.loads, arguments)

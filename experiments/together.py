@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import DATA, DOCS
+from experiments import DATA, DOCS, read_lines
 from experiments.pages import markdown_row, write_tables
 from experiments.starts import task_of_start
 from mjx_study.experiment.quadrature import Line, grid, means
@@ -202,8 +202,7 @@ def intervals() -> None:
 
 def read() -> dict[str, dict[str, Any]]:
     """Return the results so far."""
-    lines = map(json.loads, RESULTS.read_text().splitlines()) if RESULTS.exists() else ()
-    return {line.pop("case"): line for line in lines}
+    return {line.pop("case"): line for line in read_lines(RESULTS)}
 
 
 def page(results: dict[str, dict[str, Any]]) -> None:

@@ -9,7 +9,6 @@ its steps. Half a minute per model, most of it XLA compiling stock MJX.
 """
 
 import argparse
-import json
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 from mujoco.mjx._src import math as mjx_math
 
 import mjx_study
-from experiments import DATA, DOCS, ROOT
+from experiments import DATA, DOCS, ROOT, append_line, read_lines
 from experiments.drop_in import TESTED
 from experiments.pages import write_tables
 from experiments.robots import ROBOTS, loaded
@@ -191,15 +190,14 @@ def main() -> None:
     mjx_study.configure()
     for name in () if given.page else given.models:
         found = {"model": name} | compared(name)
-        with open(RESULTS, "a") as file:
-            file.write(json.dumps(found) + "\n")
+        append_line(RESULTS, found)
         print(found, flush=True)
     write_page()
 
 
 def write_page() -> None:
     """Write the table of docs/robots.md, from the last comparison of each model; tendons in one row."""
-    found = {each["model"]: each for each in map(json.loads, open(RESULTS)) if "left" not in each}
+    found = {each["model"]: each for each in read_lines(RESULTS) if "left" not in each}
     groups = {f"`{name}`": [each] for name, each in found.items() if not name.startswith("tendon/")}
     tendons = [each for name, each in found.items() if name.startswith("tendon/")]
     groups[f"`tendon/*`, {len(tendons)} models"] = tendons
