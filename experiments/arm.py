@@ -54,16 +54,8 @@ def push(horizon: int = 160, model: str | Path = MODEL, seed: int = 0, **options
         seen = study.observed(scene, state)
         heading = seen.xmat[box, :2, 0]
         reach, miss = (seen.geom_xpos[knuckle] - seen.xpos[box]) / LENGTH, (seen.xpos[box, :2] - goal) / LENGTH
-        return jnp.concatenate(
-            [
-                reach,
-                miss,
-                heading,
-                state.qvel[7:10],
-                state.qvel[12:] / 5,
-                *((state.qpos[:7] - targets, state.qvel[:7] / 5)),
-            ]
-        )
+        of_box, of_arm = (state.qvel[7:10], state.qvel[12:] / 5), (state.qpos[:7] - targets, state.qvel[:7] / 5)
+        return jnp.concatenate([reach, miss, heading, *of_box, *of_arm])
 
     def running_cost(state: ObservedState, control: Array) -> Array:
         reach = jnp.sum((state.geom_xpos[knuckle] - state.xpos[box]) ** 2) / LENGTH**2

@@ -1,4 +1,4 @@
-"""Newton on NVIDIA Warp's tape, on a CPU and in float32: variants `semi_implicit`, `xpbd`, and `old`,
+"""Newton on NVIDIA Warp's tape, on a CPU and in float32: variants `semi_implicit` and `old`,
 Newton 1.0.0, whose gravity is a number.
 
 Stiffness and damping are Newton's defaults, shared among the points of a contact. The gain of friction is `GAIN`: its
@@ -82,10 +82,7 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
         builder.add_shape_plane(plane=(-1.0, 0.0, 0.0, scene.wall), width=0.0, length=0.0, cfg=config)
     with wp.ScopedDevice("cpu"):
         model = builder.finalize(requires_grad=True)
-        if variant == "xpbd":
-            solver = newton.solvers.SolverXPBD(model, enable_restitution=scene.restitution > 0)
-        else:
-            solver = newton.solvers.SolverSemiImplicit(model)
+        solver = newton.solvers.SolverSemiImplicit(model)
         states = [model.state() for _ in range(scene.steps(timestep) + 1)]
         pipeline = newton.CollisionPipeline(model, requires_grad=True)
         contacts = [pipeline.contacts() for _ in states[1:]]
