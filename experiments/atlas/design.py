@@ -18,7 +18,7 @@ from mjx_study.choices import FAMILIES as CONTACTS
 from mjx_study.choices import laws_of
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.dynamics import initial_state
-from mjx_study.tasks import make_task
+from mjx_study.tasks import task_with_options
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
@@ -153,9 +153,7 @@ def law_cells(program: int, law: str) -> Iterator[Cell]:
 
 def task_of(name: str, timestep: float) -> Task:
     """Return a task at another timestep, with its duration kept."""
-    base = make_task(name.removesuffix("_apart"))
-    steps = round(base.horizon * base.scene.timestep / timestep)
-    task = make_task(name.removesuffix("_apart"), timestep=timestep, horizon=steps)
+    task = task_with_options(name.removesuffix("_apart"), {"timestep": timestep})
     if name.endswith("_apart"):
         qpos = task.start.qpos.at[0].add(-GAP)
         task = task.replace(name=name, start=initial_state(task.scene, qpos))

@@ -191,7 +191,8 @@ def _load(scene: Scene, pair: tuple[str, str], touches: dict[tuple[int, int], To
     moving = {int(root) for root in host.body_rootid[host.geom_bodyid[geoms]] if root}
     mass = sum(float(host.body_subtreemass[root]) for root in moving)
     speed, weight = max(0.0, touches[geoms[0], geoms[1]].speed), mass * float(np.linalg.norm(host.opt.gravity))
-    return Load(effective_mass(scene, *pair), speed, weight, _half_size(host, geoms))
+    sizes = [float(host.geom_aabb[geom, 3:].min()) for geom in geoms if host.geom_rbound[geom] > 0]  # if not unbounded
+    return Load(effective_mass(scene, *pair), speed, weight, min(sizes, default=0.1))
 
 
 def _stiffnesses(load: Load, timestep: float) -> tuple[float, ...]:
@@ -199,9 +200,3 @@ def _stiffnesses(load: Load, timestep: float) -> tuple[float, ...]:
     high = load.mass * (RESOLVED / timestep) ** 2
     low = min(load.stiffness(SINKING * load.size), high / 10)
     return tuple(rounded(value, 1) for value in np.geomspace(low, high, STIFFNESSES).tolist())
-
-
-def _half_size(host: mujoco.MjModel, geoms: Sequence[int]) -> float:
-    """Least half size of those geoms that are not unbounded [m]."""
-    sizes = [float(host.geom_aabb[geom, 3:].min()) for geom in geoms if host.geom_rbound[geom] > 0]
-    return min(sizes, default=0.1)

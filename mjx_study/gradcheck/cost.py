@@ -76,15 +76,10 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     truth = take_differences(programs.costs(cell.contact, moves(directions))[:, None])
     error = np.abs(directions @ gradient - truth.value[0])
     apart = error > DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0]
-    verdict = cost_verdict(
-        finite=bool(np.all(np.isfinite(gradient))),
-        modes=modes,
-        residual=float(residual),
-        excused=[
-            "jump" if jump else "kink" if kink else None
-            for jump, kink in zip(truth.jump[0, apart], (truth.kink[0] & (error <= truth.gap[0]))[apart], strict=True)
-        ],
-    )
+    kinks = truth.kink[0] & (error <= truth.gap[0])
+    excused = ["jump" if truth.jump[0, at] else "kink" if kinks[at] else None for at in np.flatnonzero(apart)]
+    finite = bool(np.all(np.isfinite(gradient)))
+    verdict = cost_verdict(finite=finite, modes=modes, residual=float(residual), excused=excused)
     closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
     errors = (modes, float(error.max() / scale), float(truth.gap.max() / scale), closed_form, float(residual))
     check = CostCheck(cell.family, cell.stiffness_or_zero, norm, *errors, verdict)
