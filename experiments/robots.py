@@ -27,7 +27,7 @@ import mujoco.rollout
 import numpy as np
 
 import mjx_study
-from experiments import DATA, DOCS, ROOT
+from experiments import DATA, DOCS, ROOT, read_lines
 from experiments.drop_in import STEPS, TESTED, prepared, start_states
 from experiments.native import keep, number
 from experiments.pages import write_tables
@@ -59,11 +59,9 @@ COLUMNS: Final = {
     ("engine", "rollouts"): ("C engine", "rollouts"),
     ("engine", "gradients"): ("C engine", "gradients by differences"),
 }
-BUDGET: Final = (100, 50)
-"""Iterations of the solver and of its line search."""
+BUDGET: Final = (100, 50)  # iterations of the solver and of its line search
 SAMPLES: Final = {"cpu": 256, "gpu": 16_384}
-MOST_SECONDS: Final = 900
-"""Maximum time for a route."""
+MOST_SECONDS: Final = 900  # maximum time for a route
 REPEATS: Final = 7
 
 
@@ -160,7 +158,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, help="rollouts at once, in place of the tables'")
     parser.add_argument("--precision", default="float64", choices=PRECISIONS)
     parser.add_argument("--here", action="store_true", help="measure one robot by one route in this process")
-    parser.add_argument("--into", default=RESULTS, help="file of results")
+    parser.add_argument("--into", type=Path, default=RESULTS, help="file of results")
     given = parser.parse_args()
     if given.here:
         measure(given.robots[0], given.routes[0], given.samples, given.precision)
@@ -175,7 +173,7 @@ def main() -> None:
 
 def results() -> dict[tuple[Any, ...], dict[str, Any]]:
     """The last measurement of each platform, robot, route, number of samples and precision."""
-    names, rows = ("platform", "robot", "route", "samples"), map(json.loads, open(RESULTS))
+    names, rows = ("platform", "robot", "route", "samples"), read_lines(RESULTS)
     return {(*(row[name] for name in names), row.get("precision", "float64")): row["found"] for row in rows}
 
 

@@ -30,12 +30,10 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.table import markdown_table
 
 STATES: Final = 256
-REGISTERS: Final = 255 // 2
-"""Of 64 bits, that a thread of an H100 has."""
+REGISTERS: Final = 255 // 2  # of 64 bits, that a thread of an H100 has
 OPERATIONS: Final = 34e12 / 2
 """Operations in float64 per second of an H100 (SXM), a fused multiplication and addition as one [data sheet]."""
-BANDWIDTH: Final = 3.35e12
-"""Bytes per second of an H100's memory [data sheet]."""
+BANDWIDTH: Final = 3.35e12  # bytes per second of an H100's memory [data sheet]
 
 
 def passes_of(name: str) -> dict[str, float]:

@@ -33,15 +33,11 @@ from mjx_study.table import Column, as_plain, percent, tabulate
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
-HALF_LENGTH: Final = 2.0
-"""Length of the path to either side of theta, in standard deviations of noise on theta."""
-FEEDBACK: Final = 0.02
-"""The same for noise on the controls, in the unit of theta."""
-ALONG_MEANS: Final = "means"
-"""Value of `direction` for paths along the estimators' means, see `along_means`."""
+HALF_LENGTH: Final = 2.0  # length of the path to either side of theta, in standard deviations of noise on theta
+FEEDBACK: Final = 0.02  # the same for noise on the controls, in the unit of theta
+ALONG_MEANS: Final = "means"  # value of `direction` for paths along the estimators' means, see `along_means`
 MAX_PATHS: Final = 3
-MIN_SHARE: Final = 1e-3
-"""Smallest share of a mean orthogonal to the others that warrants a path along it."""
+MIN_SHARE: Final = 1e-3  # smallest share of a mean orthogonal to the others that warrants a path along it
 
 Nodes = Callable[[int, int], None]
 """Called before each node of the paths with the number of nodes done, and of all."""
