@@ -5,7 +5,6 @@ import math
 from types import SimpleNamespace
 from typing import Any, Final
 
-import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS
@@ -52,28 +51,20 @@ class Row(SimpleNamespace):
 
 def rows_of(dataset: xr.Dataset) -> list[Row]:
     """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
-    rows, grid = [], dataset["gradient_norm"].transpose(*AXES)
+    rows = []
     names = [name for name, variable in GRADIENTS.items() if name in dataset and "param" not in variable.dims]
-
-    def along(name: str, *last: str) -> np.ndarray:
-        variable = dataset[name].variable
-        return variable.set_dims({**grid.sizes, **variable.sizes}).transpose(*AXES, *last).values
-
-    scalars, coordinates = ({name: along(name) for name in each} for each in (names, COORDINATES_OF_ROWS))
-    vectors = {name: along(name, f"{name}_entry") for name in ("solref", "solimp") if name in dataset}
-    for index in np.ndindex(grid.shape):
-        if np.isnan(scalars["residual"][index]):
-            continue  # not computed
-        numbers: dict[str, Any] = {name: values[index].item() for name, values in scalars.items()}
+    table, vectors = dataset[names].to_dataframe(dim_order=list(AXES)).reset_index(), []
+    for name in (name for name in ("solref", "solimp") if name in dataset):
+        values = dataset[name].broadcast_like(dataset["gradient_norm"]).transpose(*AXES, f"{name}_entry")
+        table[name] = list(map(tuple, values.values.reshape(len(table), -1).tolist()))
+        vectors.append(name)
+    computed = table.loc[table["residual"].notna(), [*COORDINATES_OF_ROWS, *vectors, *names]]
+    for numbers in computed.to_dict("records"):
         for name in ("alpha", "epsilon", "discrepancy", *ONSETS):
-            if name not in numbers or math.isnan(numbers[name]):
+            if math.isnan(numbers.get(name, math.nan)):
                 numbers[name] = None
-        counts = [name for name in numbers if GRADIENTS[name].digits == 0 and numbers[name] is not None]
-        numbers |= {name: int(numbers[name]) for name in counts}
-        at = {name: values[index] for name, values in coordinates.items()}
-        at = {name: value.item() if isinstance(value, np.generic) else value for name, value in at.items()}
-        solver = {name: tuple(values[index].tolist()) for name, values in vectors.items()}
-        rows.append(Row(**at, **solver, **numbers))
+        counts = [name for name in names if GRADIENTS[name].digits == 0 and numbers[name] is not None]
+        rows.append(Row(**numbers | {name: int(numbers[name]) for name in counts}))
     return rows
 
 
