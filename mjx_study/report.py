@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.study import drawings_of, plot_study
 from mjx_study.results.kind import Drawing, findings_of, kind_of
-from mjx_study.results.numbers import meanings_of, numbers_of, shown
+from mjx_study.results.rows import meanings_of, numbers_of, shown
 from mjx_study.results.warnings import warnings_of
 from mjx_study.table import plural
 

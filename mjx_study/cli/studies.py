@@ -23,7 +23,7 @@ from mjx_study.options.parser import UsageError
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.results.kind import findings_of
-from mjx_study.results.numbers import meanings_of, numbers_of
+from mjx_study.results.rows import meanings_of, numbers_of
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.table import as_plain, digits_to_tell_apart, format_table, size
