@@ -21,12 +21,11 @@ from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.mean_check import NODES, TOLERANCE, Circulation, circulations
 from estimators.registry import label_of
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.experiment.resolution import check_estimators, direction_of
+from mjx_study.experiment.resolution import CORRECTED, check_estimators, direction_of, reads_onset
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches
 from mjx_study.experiment.study import StudyPlan, estimators_of
-from mjx_study.experiment.unused_options import CORRECTED, reads_onset
 from mjx_study.objective import Simulator, chunk_for
-from mjx_study.options.rules import check_span
+from mjx_study.options.option import check_span
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import local_devices
 from mjx_study.table import Column, as_plain, percent, tabulate

@@ -17,8 +17,7 @@ from mjx_study.gradcheck.programs import Compiler, ContactCase, Programs
 from mjx_study.gradcheck.report import CostCheck, Finding, GradcheckReport, StepCheck, gravity
 from mjx_study.gradcheck.states import start_of, states_of
 from mjx_study.gradcheck.steps import check_state, collect, step_check
-from mjx_study.options.option import OptionError
-from mjx_study.options.rules import reject_untaken
+from mjx_study.options.option import OptionError, reject_untaken
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
