@@ -7,12 +7,11 @@ from typing import Any, Final
 import numpy as np
 from jax import lax
 
-from mjx_study.graph.nodes import ScalarGraph, constants, no_type_check
+from mjx_study.graph.nodes import ScalarGraph, constants
 
 Arrays = list[np.ndarray]
 
 
-@no_type_check
 class _Arithmetic:
     """Operations on scalars of one type."""
 
@@ -29,7 +28,6 @@ class _Arithmetic:
         return self._graph.scalar(primitive, arguments, self._dtype)
 
 
-@no_type_check
 def _cholesky(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     """Lower factor; NaN where the matrix is not positive definite."""
     scalars = _Arithmetic(graph, aval.dtype)
@@ -42,7 +40,6 @@ def _cholesky(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) ->
     return [factors]
 
 
-@no_type_check
 def _triangular_solve(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     """Solve op(A) X = B, or X op(A) = B as op(A)^T X^T = B^T, by substitution."""
     scalars, left, unit = _Arithmetic(graph, aval.dtype), parameters["left_side"], parameters["unit_diagonal"]
@@ -62,7 +59,6 @@ def _triangular_solve(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters:
     return [solutions if left else solutions.swapaxes(-1, -2)]
 
 
-@no_type_check
 def _sort(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     """Exchange neighbours that are out of order until none is; stable, with NaN last."""
     axis, keys = parameters["dimension"], parameters["num_keys"]
@@ -74,7 +70,6 @@ def _sort(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arr
     return [np.moveaxis(each, 0, axis) for each in arrays]
 
 
-@no_type_check
 def _top_k(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     """The k largest entries, each brought forward from the end, and their indices; the first of equal ones first."""
     axis, k = parameters["axis"], parameters["k"]
@@ -86,7 +81,6 @@ def _top_k(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Ar
     return [np.moveaxis(each[:k], 0, axis) for each in (entries, indices)]
 
 
-@no_type_check
 def _exchange(graph, arrays, after, here, keys: int = 1, reverse: bool = False) -> None:
     """Exchange two entries of arrays if the keys, the first arrays, of the second come before those of the first."""
     ordered = [[each[at] for each in arrays[:keys]] for at in (after, here)]
@@ -97,7 +91,6 @@ def _exchange(graph, arrays, after, here, keys: int = 1, reverse: bool = False) 
         each[after] = graph.scalar(lax.select_n_p, (swap, high, low), low.dtype)
 
 
-@no_type_check
 def _precedes(graph: ScalarGraph, one: Sequence[Any], other: Sequence[Any]) -> Any:
     """Whether a vector of keys comes before another in lexicographic order."""
     logic = _Arithmetic(graph, np.dtype(bool))

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from mjx_study.graph.function import Passes, ScalarFunction, depending_on
-from mjx_study.graph.nodes import ELEMENTWISE, Node, depth_first, entries_of, no_type_check
+from mjx_study.graph.nodes import ELEMENTWISE, Node, depth_first, entries_of
 from mjx_study.graph.parts import Loop, Statement, in_parts
 
 COMPARISONS: Final = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
@@ -121,7 +121,6 @@ def _type(dtype: Any) -> str:
     return name
 
 
-@no_type_check
 def _constant(value: Any) -> str:
     kind = _type(value.dtype)
     return f"ALL({kind}, {_literal(kind, value.item())})"
@@ -137,7 +136,6 @@ def _literal(kind: str, value: Any) -> str:
     return "NAN" if math.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
 
 
-@no_type_check
 class Writer:
     """Statements that compute a function; the variable of a node has its number."""
 

@@ -11,14 +11,13 @@ from typing import Any, Final
 import numpy as np
 from jax import lax
 
-from mjx_study.graph.nodes import Node, ScalarGraph, filled, no_type_check
+from mjx_study.graph.nodes import Node, ScalarGraph, filled
 
 Arrays = list[np.ndarray]
 FEWEST_ROWS: Final = 64
 """Number of possible values of a computed index from which a constant array is a table in memory."""
 
 
-@no_type_check
 def _cases(graph: ScalarGraph, index: Sequence[Any], last: Sequence[Any]) -> Iterator[tuple[list[int], Any]]:
     """Possible values from 0 to `last` of a vector of indices, and the condition that it has them."""
     spans = [range(most + 1) if isinstance(at, Node) else (int(at),) for at, most in zip(index, last, strict=True)]
@@ -31,18 +30,15 @@ def _cases(graph: ScalarGraph, index: Sequence[Any], last: Sequence[Any]) -> Ite
         yield list(values), here
 
 
-@no_type_check
 def _clipped(graph: ScalarGraph, index: Sequence[Any], last: Sequence[Any]) -> list[Any]:
     low = [graph.scalar(lax.max_p, (at, at.dtype.type(0)), at.dtype) for at in index]
     return [graph.scalar(lax.min_p, (at, at.dtype.type(most)), at.dtype) for at, most in zip(low, last, strict=True)]
 
 
-@no_type_check
 def _selected(graph: ScalarGraph, here: Any, yes: np.ndarray, no: np.ndarray, aval: Any) -> np.ndarray:
     return graph.elementwise(lax.select_n_p, [filled((), [here]), no, yes], aval.update(shape=yes.shape))
 
 
-@no_type_check
 def _dynamic_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     array, *starts = inputs
     last = [whole - size for whole, size in zip(array.shape, aval.shape, strict=True)]
@@ -57,7 +53,6 @@ def _dynamic_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: An
     return [result]
 
 
-@no_type_check
 def _in_memory(
     graph: ScalarGraph, array: np.ndarray, aval: Any, index: Sequence[Any], last: Sequence[Any]
 ) -> np.ndarray | None:
@@ -75,7 +70,6 @@ def _in_memory(
     return None if any(each is None for each in found) else filled(aval.shape, found)
 
 
-@no_type_check
 def _table(array: np.ndarray) -> np.ndarray | None:
     """An array as numbers; None if it is not constant, small, or of truth values."""
     if array.size < FEWEST_ROWS or any(isinstance(each, Node) or each.dtype == bool for each in array.flat):
@@ -83,7 +77,6 @@ def _table(array: np.ndarray) -> np.ndarray | None:
     return np.array(array.tolist(), array.flat[0].dtype)
 
 
-@no_type_check
 def _looked_up(
     graph: ScalarGraph, table: np.ndarray | None, start: Sequence[Any], last: Sequence[Any], sizes: Sequence[int]
 ) -> np.ndarray | None:
@@ -102,7 +95,6 @@ def _looked_up(
     return filled((len(places),), [graph.looked_up(table, each) for each in places])
 
 
-@no_type_check
 def _dynamic_update_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     array, update, *starts = inputs
     last = [whole - size for whole, size in zip(array.shape, update.shape, strict=True)]
@@ -113,12 +105,10 @@ def _dynamic_update_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, paramet
     return [result]
 
 
-@no_type_check
 def _window(first: Any, sizes: Any) -> tuple[slice, ...]:
     return tuple(slice(at, at + size) for at, size in zip(first, sizes, strict=True))
 
 
-@no_type_check
 class _Windows:
     """Where a gather reads or a scatter writes in an array of a shape."""
 
@@ -156,7 +146,6 @@ class _Windows:
         return _looked_up(self._graph, table, start, self._last.tolist(), self._sizes), inside
 
 
-@no_type_check
 def _gather(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     array, indices = inputs
     numbers, fill = parameters["dimension_numbers"], parameters["fill_value"]
@@ -185,7 +174,6 @@ def _gather(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> A
     return [np.moveaxis(found, range(len(batch), found.ndim), numbers.offset_dims)]
 
 
-@no_type_check
 def _scatter(combine: Any) -> Any:
     def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
         array, indices, updates = inputs

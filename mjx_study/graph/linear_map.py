@@ -12,7 +12,7 @@ from jax.core import ShapedArray
 
 from mjx_study.graph.differentiation import jacobian, pull, push
 from mjx_study.graph.function import ScalarFunction, inlined
-from mjx_study.graph.nodes import ScalarGraph, no_type_check
+from mjx_study.graph.nodes import ScalarGraph
 
 Solve = Callable[[Any, Any], Any]
 """Solution of a linear system with a symmetric matrix: (matrix, right-hand side) -> solution."""
@@ -37,7 +37,6 @@ class LinearMap:
         return LinearMap(self.pull(), lambda: self.push, early=True)
 
 
-@no_type_check
 def derivative(function: ScalarFunction, moving: tuple[int, ...]) -> LinearMap:
     """Derivative of the floating-point outputs over the inputs at the places `moving`.
 
@@ -57,7 +56,6 @@ def derivative(function: ScalarFunction, moving: tuple[int, ...]) -> LinearMap:
     return _once(function, ("derivative", moving), derived)
 
 
-@no_type_check
 def implicit_derivative(function: ScalarFunction, moving: tuple[int, ...], solve: Solve) -> LinearMap:
     """Derivative of the results S(x, a) and of the root a of G(x, a) = 0, by the implicit function theorem:
 
@@ -91,7 +89,6 @@ def implicit_derivative(function: ScalarFunction, moving: tuple[int, ...], solve
     return _once(function, ("implicit", moving, solve), derived)
 
 
-@no_type_check
 def implicit_jacobian(function: ScalarFunction, moving: tuple[int, ...], solve: Solve) -> ScalarFunction:
     """Matrix of `implicit_derivative`: rows are the entries of the results and the root, columns those that change.
 
@@ -111,7 +108,6 @@ def implicit_jacobian(function: ScalarFunction, moving: tuple[int, ...], solve: 
     return _once(function, ("jacobian", moving, solve), derived)
 
 
-@no_type_check
 def _solved(function: ScalarFunction, solve: Solve, right_side: np.ndarray) -> np.ndarray:
     """-G_a^-1 times the right-hand side."""
     slope = jacobian(function.graph, function.outputs[0], function.inputs[-1])
@@ -119,29 +115,24 @@ def _solved(function: ScalarFunction, solve: Solve, right_side: np.ndarray) -> n
     return solution
 
 
-@no_type_check
 def _sum(graph: ScalarGraph, one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return graph.elementwise(lax.add_p, [one, other], _aval(other))
 
 
-@no_type_check
 def _fresh(graph: ScalarGraph, like: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [graph.fresh("input", each.shape, _aval(each).dtype) for each in like]
 
 
-@no_type_check
 def _aval(array: np.ndarray) -> ShapedArray:
     return ShapedArray(array.shape, array.flat[0].dtype if array.size else np.dtype(float))
 
 
-@no_type_check
 def _function(function: ScalarFunction, more: Sequence[np.ndarray], outputs: list[np.ndarray]) -> ScalarFunction:
     """A function of the inputs and of more inputs in the same graph."""
     avals = [_aval(each) for each in outputs]
     return ScalarFunction(function.graph, [*function.inputs, *more], outputs, avals, None)
 
 
-@no_type_check
 def _once(function: ScalarFunction, key: Any, derived: Callable[[], Any]) -> Any:
     if key not in function.derived:
         function.derived[key] = derived()

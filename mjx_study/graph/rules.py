@@ -15,14 +15,13 @@ from jax.core import ShapedArray
 
 from mjx_study.graph.algebra import ALGEBRA
 from mjx_study.graph.indexing import INDEXING
-from mjx_study.graph.nodes import ScalarGraph, constants, filled, no_type_check
+from mjx_study.graph.nodes import ScalarGraph, constants, filled
 
 Arrays = list[np.ndarray]
 Parameters = dict[str, Any]
 Rule = Callable[[ScalarGraph, Arrays, Any, Parameters], Arrays | None]
 
 
-@no_type_check
 def _broadcast(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     shape = [1] * len(aval.shape)
     for place, size in zip(parameters["broadcast_dimensions"], inputs[0].shape, strict=True):
@@ -30,13 +29,11 @@ def _broadcast(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parame
     return [np.broadcast_to(inputs[0].reshape(shape), aval.shape)]
 
 
-@no_type_check
 def _slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     bounds = parameters["start_indices"], parameters["limit_indices"], parameters["strides"] or (1,) * len(aval.shape)
     return [inputs[0][tuple(itertools.starmap(slice, zip(*bounds, strict=True)))]]
 
 
-@no_type_check
 def _pad(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     array, filler = inputs
     if any(low < 0 or high < 0 or between for low, high, between in parameters["padding_config"]):
@@ -47,7 +44,6 @@ def _pad(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) 
     return [padded]
 
 
-@no_type_check
 def _reduction(combine: Any) -> Rule:
     def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
         (array,), axes = inputs, parameters["axes"]
@@ -60,7 +56,6 @@ def _reduction(combine: Any) -> Rule:
     return rule
 
 
-@no_type_check
 def _place_of_extreme(better: Any) -> Rule:
     def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
         rows = np.moveaxis(inputs[0], parameters["axes"][0], -1)
@@ -76,7 +71,6 @@ def _place_of_extreme(better: Any) -> Rule:
     return rule
 
 
-@no_type_check
 def _one_minus_square(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     """(1 + x) (1 - x), an operation of its own from JAX 0.11 on."""
     one = constants(np.ones((), aval.dtype))
@@ -84,7 +78,6 @@ def _one_minus_square(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters:
     return [graph.elementwise(lax.mul_p, factors, aval)]
 
 
-@no_type_check
 def _cumsum(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     result = inputs[0].copy()
     rows = np.moveaxis(np.flip(result, parameters["axis"]) if parameters["reverse"] else result, parameters["axis"], 0)
@@ -94,7 +87,6 @@ def _cumsum(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameter
     return [result]
 
 
-@no_type_check
 def _dot(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     (over, batch), factors = parameters["dimension_numbers"], []
     for array, summed, shared in zip(inputs, over, batch, strict=True):
@@ -114,7 +106,6 @@ def _dot(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) 
     return [total.reshape(aval.shape)]
 
 
-@no_type_check
 def _reinterpreted(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     same = inputs[0].shape == aval.shape and aval.dtype != bool
     return [graph.elementwise(lax.bitcast_convert_type_p, inputs, aval, **parameters)] if same else None

@@ -17,7 +17,7 @@ from jax.core import Tracer
 
 from mjx_study.graph.function import ScalarFunction, capture, is_input
 from mjx_study.graph.native import count_left, native_identity
-from mjx_study.graph.nodes import TooLargeError, no_type_check
+from mjx_study.graph.nodes import TooLargeError
 from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
@@ -88,7 +88,6 @@ def _name(function: Callable[..., Any]) -> Any:
     return function
 
 
-@no_type_check
 def _content(leaf: Any) -> Any:
     """Return what a graph depends on: the type of traced leaves, the value of others."""
     if is_input(leaf):
