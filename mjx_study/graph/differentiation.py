@@ -207,15 +207,10 @@ def _along(graph: ScalarGraph, node: Node, place: int, change: Any, kind: Any) -
             strict = scalar(lax.select_n_p, wins, dtype.type(0), dtype.type(1))
             return scalar(lax.mul_p, change, scalar(lax.select_n_p, ties, strict, dtype.type(0.5)))
         case "convert_element_type":
-            return _converted(graph, change, kind)
+            return graph.converted(change, kind)
     closed = _rule(node.operation, place, tuple(each.dtype for each in arguments), tuple(node.parameters.items()))
     (result,) = run(graph, closed, [filled((), [each]) for each in (change, *arguments)])
     return result[()]
-
-
-def _converted(graph: ScalarGraph, value: Any, dtype: Any) -> Any:
-    parameters = {"new_dtype": dtype, "weak_type": False, "sharding": None}
-    return graph.scalar(lax.convert_element_type_p, (value,), dtype, **parameters)
 
 
 @cache

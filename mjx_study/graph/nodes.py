@@ -161,14 +161,18 @@ class ScalarGraph:
             found = value
             if value.number in self._sums:
                 differs = self.scalar(lax.ne_p, (value, value), np.dtype(bool))  # never, but no compiler knows
-                zero = self.scalar(lax.convert_element_type_p, (differs,), value.dtype, **_conversion(value.dtype))
-                found = self.scalar(lax.add_p, (value, zero), value.dtype)
+                found = self.scalar(lax.add_p, (value, self.converted(differs, value.dtype)), value.dtype)
             elif getattr(value.operation, "name", None) in _KEEPS_SIGNED_ZEROS:
                 arguments = tuple(map(self._signed, value.arguments))
                 if any(one is not other for one, other in zip(arguments, value.arguments, strict=True)):
                     found = self.scalar(value.operation, arguments, value.dtype, **value.parameters)
             self._from_zero[value.number] = found
         return self._from_zero[value.number]
+
+    def converted(self, value: Any, dtype: Any) -> Any:
+        """Return an entry as another type."""
+        parameters = {"new_dtype": dtype, "weak_type": False, "sharding": None}
+        return self.scalar(lax.convert_element_type_p, (value,), dtype, **parameters)
 
     def elementwise(self, primitive: Any, inputs: Sequence[np.ndarray], aval: Any, **parameters: Any) -> np.ndarray:
         spread = [np.broadcast_to(each, aval.shape).flat for each in inputs]
@@ -234,10 +238,6 @@ def _may_be_minus_zero(value: Any) -> bool:
             return value.arguments[0] is not value.arguments[1]
         case name:
             return name not in ("abs", "square")
-
-
-def _conversion(dtype: Any) -> dict[str, Any]:
-    return {"new_dtype": dtype, "weak_type": False, "sharding": None}
 
 
 def _identity(value: Any) -> Any:
