@@ -17,6 +17,8 @@ from jax.extend.core import Literal
 from mjx_study.graph.nodes import ELEMENTWISE, Node, ScalarGraph, constants, entries_of, filled, needed_for
 from mjx_study.graph.rules import RULES
 
+MOST_KEPT: Final = 64
+"""Maximum number of functions of a kind that are kept."""
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 _WITH_RULES: Final = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "ruled": "jaxpr"}
@@ -33,7 +35,7 @@ class ScalarFunction:
         outputs: one array of nodes and NumPy scalars per output.
         avals: types of the outputs.
         structure: pytree of the outputs.
-        derived: what has been derived from it, by kind.
+        values: the function captured for its values only, if that differs.
     """
 
     graph: ScalarGraph
@@ -41,7 +43,7 @@ class ScalarFunction:
     outputs: list[np.ndarray]
     avals: Sequence[Any]
     structure: Any
-    derived: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False)
+    values: "ScalarFunction | None" = None
 
     @cached_property
     def needed(self) -> list[Node]:
@@ -64,16 +66,17 @@ class ScalarFunction:
     @property
     def types(self) -> list[ShapedArray]:
         """Types of the inputs."""
-        return [ShapedArray(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in self.inputs]
+        return list(map(aval_of, self.inputs))
 
     def of(self, places: Sequence[int]) -> "ScalarFunction":
         """Return the function of some of its inputs, which does not depend on the others."""
-        key = "of", tuple(places)
-        if key not in self.derived:
-            self.derived[key] = dataclasses.replace(self, inputs=[self.inputs[place] for place in places])
-            if "values" in self.derived:
-                self.derived[key].derived["values"] = self.derived["values"].of(places)
-        return self.derived[key]
+        values = None if self.values is None else self.values.of(places)
+        return dataclasses.replace(self, inputs=[self.inputs[place] for place in places], values=values)
+
+
+def aval_of(array: np.ndarray) -> ShapedArray:
+    """Type of an array of entries; that of an empty one is float."""
+    return ShapedArray(array.shape, array.flat[0].dtype if array.size else np.dtype(float))
 
 
 def _count(nodes: list[Node], found: set[int]) -> None:
@@ -131,8 +134,7 @@ def capture(function: Callable[..., Any], *arguments: Any, most: int, values_onl
 
 def inlined(graph: ScalarGraph, function: Callable[..., Any], *arrays: np.ndarray) -> list[np.ndarray]:
     """Add a function of floating-point arrays of nodes to a graph; its leaves."""
-    kinds = [jax.ShapeDtypeStruct(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in arrays]
-    return run(graph, jax.make_jaxpr(function)(*kinds), arrays)
+    return run(graph, jax.make_jaxpr(function)(*map(aval_of, arrays)), arrays)
 
 
 def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
