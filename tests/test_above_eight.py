@@ -304,7 +304,8 @@ def test_a_quadrupeds_steps_are_those_of_mjxs_arrays(load: Callable[[], Scene]) 
 
     def by_tape(adjoints, qacc, *point):
         def after(qpos, qvel, control):
-            return dynamics._at_solution(scene, scene.model, qacc, qpos, qvel, jnp.zeros(0), control)[:2]
+            forced = partial(dynamics._forced, scene)
+            return dynamics.at_solution(forced, scene.model, qacc, qpos, qvel, jnp.zeros(0), control)[:2]
 
         return jax.vjp(after, *point)[1](tuple(adjoints))
 

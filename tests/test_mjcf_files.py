@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mjx_study.simulation import mjcf_compile
-from mjx_study.simulation.mjcf_files import DEEPEST
-from mjx_study.simulation.mjcf_text import Element, elements
+from mjx_study.simulation.mjcf_files import DEEPEST, Element, elements
 from mjx_study.simulation.scene import SceneError, load_model, models_folder, put_scene
 from tests.faults import deadline
 
