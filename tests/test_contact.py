@@ -105,18 +105,6 @@ def test_the_penalty_limit_is_a_spring_and_a_damper(normal_acceleration) -> None
             assert measured == pytest.approx(force, rel=1e-3)
 
 
-def test_the_penalty_adds_to_other_forces_as_the_impedance_falls(normal_acceleration) -> None:
-    """a_1 - (a_0 + F / m) falls linearly with the impedance: tenfold per decade."""
-    _, scene, acceleration = normal_acceleration
-    spring = STIFFNESS * PENETRATION / MASS
-    free = -9.0
-    gaps = [acceleration(in_units(scene, d), 0.0, free) - (free + spring) for d in (1e-2, 1e-3, 1e-4)]
-    # the next order of the expansion is g d: 10 percent at most in the first decade, 1 percent in the second
-    assert gaps[0] / gaps[1] == pytest.approx(10, rel=0.1)
-    assert gaps[1] / gaps[2] == pytest.approx(10, rel=0.01)
-    assert gaps[2] == pytest.approx(0, abs=1e-4 * 12 * (spring - free))
-
-
 @pytest.mark.parametrize("impedance", [1e-3, 0.5, 0.9])
 def test_the_law_of_contact(normal_acceleration, impedance: float) -> None:
     """a_1 = (1 - d) a_0 - b v - k r, exact for a single normal row; with its gain for a pyramid."""
@@ -211,17 +199,6 @@ def test_what_is_not_given_stays_the_mjcfs() -> None:
     model = apply_contact(scene.model, contact_model(DEFAULT_SOLREF, scene=scene))
     for name in ("geom_friction", "geom_margin", "pair_friction", "pair_margin"):
         assert getattr(model, name) is getattr(scene.model, name)
-
-
-def test_contact_models_stack_under_vmap() -> None:
-    scene = scene_of(PAIRED)
-    models = [contact_model((-k, -1.0), margin=m, scene=scene) for k, m in ((100.0, 0.0), (300.0, 0.001))]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
-    applied = jax.jit(jax.vmap(lambda contact: apply_contact(scene.model, contact), axis_size=2))(stacked)
-    for index, contact in enumerate(models):
-        alone = apply_contact(scene.model, contact)
-        for name in ("geom_solref", "pair_solref", "geom_solimp", "pair_solimp", "geom_margin", "pair_margin"):
-            np.testing.assert_array_equal(getattr(applied, name)[index], getattr(alone, name))
 
 
 @pytest.mark.parametrize(

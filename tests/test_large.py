@@ -21,7 +21,7 @@ from mjx_study.execution.run import run_study
 from mjx_study.experiment import gradients
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.gradients import GradientComputation, block_of, blocks_of
-from mjx_study.experiment.merged_samples import REFERENCE_UNIT, Blocks
+from mjx_study.experiment.merged_samples import Blocks
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.sampling import cell_keys, sample_keys
 from mjx_study.experiment.study import StudyPlan
@@ -124,15 +124,6 @@ def test_not_a_bit_depends_on_the_order_or_on_checkpoints(cell: Computed) -> Non
         }
     for name, array in found.numbers().items():
         np.testing.assert_array_equal(array, numbers[name], err_msg=name)
-
-
-def test_no_more_is_kept_than_the_logarithm_of_the_blocks(cell: Computed) -> None:
-    for late in range(1, 12):
-        order = [unit for unit in range(12) if unit != late]
-        blocks = in_order(cell, order)
-        assert blocks.missing == [late] and len(blocks._held) <= 4 + 2  # levels, and the rest of 11
-    assert in_order(cell, []).missing == list(range(12))
-    assert in_order(cell, [REFERENCE_UNIT, 3]).missing == [1, 2, *range(4, 12)]
 
 
 def test_a_study_in_blocks_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

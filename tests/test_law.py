@@ -1,7 +1,5 @@
 """Contact laws beyond MuJoCo's: static load, derivatives, what commands leave out for them, refusals."""
 
-import builtins
-import dataclasses
 import json
 import sys
 from collections.abc import Callable
@@ -25,7 +23,6 @@ from mjx_study.graph import scalars
 from mjx_study.graph.native import SWITCH
 from mjx_study.objective import rollout_cost
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.simulation import dynamics
 from mjx_study.simulation.contact import apply_contact, cone_edges, effective_mass, family_model
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.law import LAWS, MujodicoLaw
@@ -194,22 +191,6 @@ def test_a_timestep_may_be_a_number(most: int, monkeypatch: pytest.MonkeyPatch) 
     assert float(fallen) == pytest.approx(-9.81 * 5e-4, rel=0.01)  # a rounded force acts at a distance
 
 
-@pytest.mark.parametrize("law", ["kelvin_voigt", "conic"])
-def test_the_graph_has_the_packages_own_derivative(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, graphs = ball(), []
-    advance = stepping(scene, law, 2000.0 if study.FAMILIES[law].swept else None)
-    qpos, qvel = scene.template.qpos.at[2].set(0.099), jnp.array([0.3, 0.1, -0.2, 0.4, -0.3, 0.2])
-    start = study.initial_state(scene, qpos, qvel)
-    make = dynamics.by_graph
-    monkeypatch.setattr(dynamics, "by_graph", lambda *given: graphs.append(make(*given)) or graphs[-1])
-    slope = lambda: jax.jit(jax.jacfwd(lambda qvel: advance(state=dataclasses.replace(start, qvel=qvel))[0].qvel))  # noqa: E731
-    graph = slope()(qvel)
-    assert len(graphs) == 1 and graphs[0] is not None
-    monkeypatch.setattr(type(advance.args[1].law), "equations", lambda *_: None)
-    np.testing.assert_allclose(graph, slope()(qvel), atol=1e-7)
-    assert len(graphs) == 1
-
-
 def test_diagnose_judges_means_under_every_law(monkeypatch: pytest.MonkeyPatch) -> None:
     """What begins, and how much its step varies, hardly depend on the law: the ball flies freely until then."""
     printed, found, pages = [], {}, {}
@@ -318,16 +299,3 @@ def test_forces_and_onsets_of_mujocos_law_are_refused() -> None:
     for onset in ("linear", "jump"):
         with pytest.raises(ValueError, match="the onset term is that of MuJoCo's law"):
             rollout_cost(task, task.theta, contact, study.initial_state(task.scene), noise, onset)
-
-
-def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = builtins.__import__
-
-    def without(name: str, *rest):
-        if name.startswith("mujodico"):
-            raise ModuleNotFoundError(f"No module named {name!r}")
-        return own(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ValueError, match=r"pip install 'mjx-study\[laws\]'"):
-        family_model("conic", ball(), effective_mass=1.0)

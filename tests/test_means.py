@@ -8,21 +8,9 @@ import pytest
 
 from estimators import make_estimator
 from mjx_study.cli import main
-from mjx_study.diagnose.means import check_mean, lines_of, term_lines
+from mjx_study.diagnose.means import check_mean, term_lines
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
-
-
-@pytest.mark.slow
-def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> None:
-    task = make_task("momentum_transfer").replace(theta=jnp.full(1, 0.3))
-    cells, _ = family_grid(task, ("mujoco_default",))
-    chosen = [make_estimator(name) for name in ("fobg", "fobg_onset")]
-    plain, corrected = check_mean(task, cells, chosen, samples=400, seed=0)
-    assert plain.verdict == "biased" and plain.circulation.gap > 0.4 * abs(plain.circulation.difference)
-    assert corrected.verdict == "right"
-    assert 2 * corrected.circulation.half_width < 0.05 * abs(corrected.circulation.difference)
-    assert len(lines_of([plain, corrected])) >= 3
 
 
 def test_estimators_take_their_options(capsys: pytest.CaptureFixture[str]) -> None:

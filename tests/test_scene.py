@@ -14,10 +14,7 @@ import numpy as np
 import pytest
 
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
-from mjx_study.cli.options import given_options
 from mjx_study.graph.native import native_identity
-from mjx_study.options.configuration import as_arguments
-from mjx_study.options.parser import TASK_OPTIONS, Parser
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.limitations import FLAGS
 from mjx_study.simulation.scene import (
@@ -52,13 +49,6 @@ def test_a_name_needs_no_particular_working_directory(tmp_path: Path) -> None:
     code = "from mjx_study.simulation.scene import load_scene; print(load_scene('pusher').host.nq)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, "2\n"), done.stderr
-
-
-def test_a_path_is_loaded_and_left_as_it_is(tmp_path: Path) -> None:
-    path = tmp_path / "copy.xml"
-    path.write_text((models_folder() / "pusher.xml").read_text())
-    assert load_scene(path).name == "copy"
-    assert load_scene(str(path)).host.nv == 2
 
 
 ENUMERATED = {
@@ -164,21 +154,6 @@ def test_options_that_mjx_lacks_are_refused_and_what_is_told_helps(
 def test_energy_that_mjx_would_not_compute_is_left_out() -> None:
     host = mujoco.MjModel.from_xml_string(floor_scene(FREE_BOX, '<option><flag energy="enable"/></option>'))
     assert put_scene(host, "here").host.opt.enableflags == 0 < host.opt.enableflags
-
-
-def test_the_command_line_changes_what_is_refused(tmp_path: Path) -> None:
-    """The model of a file with everything that a message tells one to give, as `gradcheck` reads it."""
-    path = tmp_path / "walker.xml"
-    option = '<option integrator="RK4" solver="PGS"><flag fwdinv="enable" sleep="enable"/></option>'
-    path.write_text(floor_scene(FREE_BOX, option))
-    parser = Parser()
-    parser.add_builder_options()
-    given = "--solver newton --disable-flag fwdinv,sleep --integrator euler".split()
-    for count, message in ((0, "--solver"), (2, "--disable-flag fwdinv,sleep"), (4, "--integrator")):
-        with pytest.raises(SceneError, match=message):
-            load_scene(path, **as_arguments(given_options(parser.parse_args(given[:count]), *TASK_OPTIONS)))
-    chosen = as_arguments(given_options(parser.parse_args(given), *TASK_OPTIONS))
-    assert load_scene(path, **chosen).host.opt.enableflags == 0
 
 
 @pytest.mark.parametrize("flag", FLAGS)

@@ -60,11 +60,6 @@ def verdict(
     return VERDICTS[codes[1, 0]]
 
 
-def test_names_of_the_layout() -> None:
-    assert [str(source) for source in layout().inputs] == ["qpos[x]", "qvel[x]", "ctrl[push]"]
-    assert [str(output) for output in layout().outputs] == ["qpos[x]", "qvel[x]"]
-
-
 NAN, INF = float("nan"), float("inf")
 
 
