@@ -100,6 +100,9 @@ def linear(slope: np.ndarray, sigma: float) -> OneStep:
     return OneStep(lambda x: jnp.sum(jnp.asarray(slope, x.dtype) * x), len(slope), sigma)
 
 
+HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
+
+
 def quadratic(hessian: np.ndarray, sigma: float) -> OneStep:
     """x^T hessian x / 2."""
     return OneStep(lambda x: 0.5 * x @ jnp.asarray(hessian, x.dtype) @ x, len(hessian), sigma)

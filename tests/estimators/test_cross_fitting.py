@@ -13,10 +13,9 @@ from tests.estimators import objectives
 from tests.estimators.statistics_helpers import assert_mean_is
 
 FEEDBACK = objectives.LinearQuadratic()
-HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
 CASES = {
     "feedback": (FEEDBACK, np.array([0.4, 0.1, 0.2, 0.5])),
-    "open loop": (objectives.quadratic(HESSIAN, 0.7), np.array([0.5, -0.6, 0.3])),
+    "open loop": (objectives.quadratic(objectives.HESSIAN, 0.7), np.array([0.5, -0.6, 0.3])),
 }
 WEIGHED = ("aobg", "ivw", "ivw_h", "total_propagation", "ddcg")
 SAMPLES, TRIALS = 10, 30_000
@@ -24,7 +23,9 @@ SAMPLES, TRIALS = 10, 30_000
 
 def exact(case: str) -> np.ndarray:
     theta = jnp.asarray(CASES[case][1])
-    return np.asarray(jax.grad(FEEDBACK.expected_cost)(theta) if case == "feedback" else jnp.asarray(HESSIAN) @ theta)
+    return np.asarray(
+        jax.grad(FEEDBACK.expected_cost)(theta) if case == "feedback" else jnp.asarray(objectives.HESSIAN) @ theta
+    )
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from tests.estimators.statistics_helpers import assert_mean_is
 SAMPLES = 200_000
 RNG = np.random.default_rng(0)
 SLOPE = RNG.normal(size=4)
-HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
 FEEDBACK = objectives.LinearQuadratic()
 
 
@@ -29,7 +28,11 @@ class Case(NamedTuple):
 
 CASES = {
     "linear": Case(objectives.linear(SLOPE, 0.5), [0.1, -0.3, 0.2, 0.4], lambda theta: jnp.asarray(SLOPE)),
-    "quadratic": Case(objectives.quadratic(HESSIAN, 0.7), [1.5, -2.0, 1.0], lambda theta: jnp.asarray(HESSIAN) @ theta),
+    "quadratic": Case(
+        objectives.quadratic(objectives.HESSIAN, 0.7),
+        [1.5, -2.0, 1.0],
+        lambda theta: jnp.asarray(objectives.HESSIAN) @ theta,
+    ),
     "linear-quadratic": Case(FEEDBACK, [0.4, 0.1, 0.2, 0.5], jax.grad(FEEDBACK.expected_cost)),
     "heaviside": Case(objectives.heaviside(0.6), [0.3], lambda theta: objectives.heaviside_gradient(theta, 0.6), False),
     "relaxed heaviside": Case(
