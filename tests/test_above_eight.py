@@ -260,15 +260,10 @@ def test_a_ball_on_a_height_field(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(slopes[same], expected_slopes[same], rtol=0, atol=1e-8 * scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "to_engine"),
-    [
-        ("quadruped", 1e-11),
-        pytest.param("arm", 1e-11, marks=pytest.mark.slow),
-        pytest.param("humanoid", 1e-11, marks=pytest.mark.slow),
-        pytest.param("barkour_v0", 2e-5, marks=pytest.mark.slow),
-        pytest.param(EDGES, 1e-11, marks=pytest.mark.slow),
-    ],
+    [("quadruped", 1e-11), ("arm", 1e-11), ("humanoid", 1e-11), ("barkour_v0", 2e-5), (EDGES, 1e-11)],
 )
 def test_steps_and_derivatives_are_those_of_stock_mjx(name: str, to_engine: float) -> None:
     """From states in contact, and in the C engine's distance, which MJX's edges of height fields make larger."""

@@ -87,10 +87,7 @@ def compare(function, *points, rtol=1e-12, exact=False):
 
 
 def test_every_operation_is_covered():
-    others = {"not", "copysign"} - ELEMENTWISE
-    named = {*FLOATS, *PAIRS, *WHOLE} - {"of one", "one of three", "booleans"}
-    named |= {"not", "shift_left", "shift_right_logical"}
-    assert ELEMENTWISE - named == set() and not others - {"copysign"}
+    assert {*FLOATS, *PAIRS, *WHOLE, "not", "shift_left", "shift_right_logical"} >= ELEMENTWISE
 
 
 @pytest.mark.parametrize("name", FLOATS)
@@ -261,11 +258,6 @@ def test_a_failing_compiler_is_reported_and_done_without(folder, monkeypatch, ca
     monkeypatch.setattr(native, "library_ready", lambda name: False)
     found = jax.jit(jax.vmap(lambda x: unrolled(lambda x: x**3 + 7, x)))(ROW)
     np.testing.assert_allclose(found, ROW**3 + 7)
-
-
-def test_what_cannot_be_loaded_is_reported(folder, capsys):
-    assert build._loaded("mjx_study_nothing", b"no library") is None
-    assert "mjx-study: native code cannot be loaded, steps run through XLA:" in capsys.readouterr().err
 
 
 ALONE = """

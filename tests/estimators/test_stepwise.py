@@ -1,6 +1,5 @@
 """Estimates from single steps and from the backward recursion: identities, means, variances, and where they fail."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import jax
@@ -27,12 +26,13 @@ from estimators import (
     total_propagation,
     truncated_first_order,
 )
+from estimators.noise import split_sample_key
 from estimators.stepwise import control_scores
 from tests.estimators import objectives
 from tests.estimators.statistics_helpers import assert_mean_is
 
 SAMPLES = 100_000
-FEEDBACK = objectives.LinearQuadratic()
+FEEDBACK, SYSTEM = objectives.FEEDBACK, objectives.SYSTEM
 THETA = np.array([0.4, 0.1, 0.2, 0.5])
 NEUTRAL = ("fobg_clipped", "fobg_truncated")
 """Biased in general, but not with a clip beyond every sample and a window beyond the horizon."""
@@ -47,31 +47,25 @@ def make(name: str, objective, **changes) -> Estimator:
     return estimators.make_estimator(name, **options)
 
 
-def run(name: str, objective, theta, *, samples: int = SAMPLES, seed: int = 3, **changes) -> GradientEstimate:
-    estimator = make(name, objective, **changes)
-    program = jax.jit(lambda key: estimators.estimate(estimator, objective, jnp.asarray(theta), key, samples))
-    return program(jax.random.key(seed))
+def run_all(chosen: dict[str, Estimator], objective, theta, samples: int = SAMPLES) -> dict[str, GradientEstimate]:
+    """What each gives of the same batches."""
+    needed = estimators.oracles_of(chosen.values())
+    drawn = estimators.draw(needed, objective, jnp.asarray(theta), jax.random.key(3), samples)
+    return {name: jax.jit(each)({oracle: drawn[oracle] for oracle in each.needs}) for name, each in chosen.items()}
 
 
-def run_all(names: Iterable[str], objective, theta) -> dict[str, GradientEstimate]:
-    """What `run` gives for each, by one program: the batches that several need are drawn once."""
-    chosen = {name: make(name, objective) for name in names}
-
-    @jax.jit
-    def program(key):
-        needed = estimators.oracles_of(chosen.values())
-        drawn = estimators.draw(needed, objective, jnp.asarray(theta), key, SAMPLES)
-        return {name: each({oracle: drawn[oracle] for oracle in each.needs}) for name, each in chosen.items()}
-
-    return program(jax.random.key(3))
+def run(name: str, objective, theta, *, samples: int = SAMPLES, **changes) -> GradientEstimate:
+    return run_all({name: make(name, objective, **changes)}, objective, theta, samples)[name]
 
 
 @pytest.fixture(scope="module")
 def lots() -> dict[str, dict[str, GradientEstimate]]:
     """Every estimator on a feedback policy and on an open loop, both smooth."""
+    smooth = objectives.quadratic(objectives.HESSIAN, 0.7)
+    every = {name: make(name, FEEDBACK) for name in ESTIMATORS if name != "delta"}
     return {
-        "feedback": run_all([name for name in ESTIMATORS if name != "delta"], FEEDBACK, THETA),
-        "open loop": run_all(ESTIMATORS, objectives.quadratic(objectives.HESSIAN, 0.7), [1.5, -2.0, 1.0]),
+        "feedback": run_all(every, FEEDBACK, THETA),
+        "open loop": run_all({name: make(name, smooth) for name in ESTIMATORS}, smooth, [1.5, -2.0, 1.0]),
     }
 
 
@@ -80,11 +74,7 @@ def lots() -> dict[str, dict[str, GradientEstimate]]:
 def test_every_estimator_is_unbiased_where_the_objective_is_smooth(case: str, name: str, lots) -> None:
     if (case, name) == ("feedback", "delta"):
         pytest.skip("its mean is known for noise on theta itself only")
-    exact = (
-        jax.grad(FEEDBACK.expected_cost)(jnp.asarray(THETA))
-        if case == "feedback"
-        else objectives.HESSIAN @ np.array([1.5, -2.0, 1.0])
-    )
+    exact = objectives.of_feedback(THETA)[1] if case == "feedback" else objectives.HESSIAN @ np.array([1.5, -2.0, 1.0])
     estimate = lots[case][name]
     z = (np.asarray(estimate.mean) - np.asarray(exact)) / np.asarray(estimate.standard_error)
     assert np.all(np.abs(z) < 4.0), z
@@ -117,7 +107,7 @@ def test_estimators_at_a_jump(name: str) -> None:
 @pytest.mark.parametrize("baseline", ["none", "zero_noise", "leave_one_out"])
 def test_costs_to_go_are_unbiased_with_every_baseline(baseline: str) -> None:
     estimate = run("zobg_to_go", FEEDBACK, THETA, samples=400_000, baseline=baseline)
-    assert_mean_is(estimate.per_sample, jax.grad(FEEDBACK.expected_cost)(jnp.asarray(THETA)), resolution=0.1)
+    assert_mean_is(estimate.per_sample, objectives.of_feedback(THETA)[1], resolution=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -125,20 +115,17 @@ def few() -> tuple[Differentiation, StepDifferentiation, Linearisation, StepEval
     """The same 40 rollouts in every form."""
     theta, keys = jnp.asarray(THETA), jax.random.split(jax.random.key(5), 40)
 
-    @jax.jit
-    def draw(keys):
-        methods = ("differentiate", "differentiate_steps", "linearise", "evaluate_steps", "evaluate")
-        return tuple(getattr(FEEDBACK, name)(theta, jax.random.clone(keys)) for name in methods)
-
-    return draw(keys)
+    methods = ("differentiate", "differentiate_steps", "linearise", "evaluate_steps", "evaluate")
+    return tuple(getattr(FEEDBACK, name)(theta, jax.random.clone(keys)) for name in methods)
 
 
 @pytest.mark.parametrize("window", [1, 2])
 def test_a_truncated_adjoint_is_a_sum_over_windows(few, window: int) -> None:
     """Against forward differentiation of each window's costs alone, from the states where it begins."""
     linearisation = few[2]
-    theta, keys = jnp.asarray(THETA), jax.random.split(jax.random.key(5), 40)
-    starts, noise = jax.vmap(FEEDBACK.sample)(keys)
+    keys = jax.random.split(jax.random.key(5), 40)
+    starts = jax.vmap(lambda key: objectives.draw_start(split_sample_key(key)[0]))(keys)
+    noise = FEEDBACK.sigma**2 * linearisation.steps.noise_score
     cuts = [*range(0, FEEDBACK.horizon, window), FEEDBACK.horizon]
 
     def cost(theta: Array, start: Array, noise: Array) -> Array:
@@ -147,13 +134,13 @@ def test_a_truncated_adjoint_is_a_sum_over_windows(few, window: int) -> None:
             state = jax.lax.stop_gradient(state)
             for step in range(low, high):
                 control = theta.reshape(2, 2) @ state + noise[step]
-                total += state @ FEEDBACK.state_cost @ state + control @ FEEDBACK.control_cost @ control
-                state = jnp.asarray(FEEDBACK.transition) @ state + jnp.asarray(FEEDBACK.control) @ control
+                total += state @ SYSTEM.state_weight @ state + control @ SYSTEM.control_weight @ control
+                state = jnp.asarray(SYSTEM.transition) @ state + jnp.asarray(SYSTEM.control) @ control
             if high == FEEDBACK.horizon:
-                total += state @ FEEDBACK.state_cost @ state
+                total += state @ SYSTEM.final_weight @ state
         return total
 
-    expected = jax.jit(jax.vmap(jax.grad(cost), in_axes=(None, 0, 0)))(theta, starts, noise)
+    expected = jax.jit(jax.vmap(jax.grad(cost), in_axes=(None, 0, 0)))(jnp.asarray(THETA), starts, noise)
     np.testing.assert_allclose(truncated_first_order(linearisation, window).per_sample, expected, rtol=1e-11)
 
 

@@ -30,7 +30,7 @@ PLAIN = SERVO.replace('forcerange="-1 1"', "")
 
 @cache
 def layout(xml: str = PLAIN) -> Coordinates:
-    return make_coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
+    return make_coordinates(scene_of(xml), None)
 
 
 def at(qpos: Any, qvel: Any) -> HostState:

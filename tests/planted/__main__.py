@@ -19,8 +19,7 @@ from pathlib import Path
 from experiments.pages import write_tables
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.table import format_table, markdown_table
-from tests.planted import DEFECTS
-from tests.planted.defect import Defect, plant
+from tests.planted.defects import DEFECTS, Defect, plant
 from tests.planted.models import MODELS
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,9 +1,9 @@
-"""The pusher's contact as a law of nature, which conserves momentum; and the published order of variances."""
+"""Contact of the pusher and of the sliding box as laws of nature; their numbers are in `test_published`."""
 
 import numpy as np
 import pytest
 
-from mjx_study.reference import Pusher, roll_out
+from mjx_study.reference import Pusher, SlidingBox, roll_out
 from tests.pusher_fixtures import HORIZON, INPUTS, START
 
 
@@ -36,3 +36,15 @@ def test_contact_only_pushes():
     pulled = roll_out(Pusher(1000.0), START, np.full((50, 1), -1.0)).states
     np.testing.assert_array_equal(pulled[:, [1, 3]], np.broadcast_to([1.0, 0.0], (51, 2)))
     assert pulled[-1, 0] < -0.1
+
+
+def test_friction_is_internal_and_limited():
+    """Total momentum follows the force alone; the box is never driven by more than mu v_s."""
+    system, rng = SlidingBox(), np.random.default_rng(0)
+    controls = 0.3 + 0.3 * rng.standard_normal((400, 1))
+    states = roll_out(system, np.zeros(4), controls).states
+    momentum = system.mass * states[:, 2:].sum(axis=1)
+    np.testing.assert_allclose(momentum[1:], system.timestep * np.cumsum(controls), rtol=1e-12)
+    force = system.mass * np.diff(states[:, 3]) / system.timestep
+    assert np.abs(force).max() == pytest.approx(system.viscosity * system.slip_tolerance)
+    assert np.all(force[~system.on_box(states[:-1])] == 0) and not system.on_box(states).all()
