@@ -127,9 +127,8 @@ def test_the_elliptic_law_is_the_gradient_of_a_convex_cost() -> None:
     assert sliding >= 4
 
 
-@pytest.fixture(scope="module")
-def resting():
-    """A ball that presses on the plane, and the residual over acceleration and height."""
+def test_the_residual_measures_the_distance_from_the_solution() -> None:
+    """Of a ball that presses on the plane."""
     scene = scene_of(floor_scene(slider(3), option(extra='cone="elliptic"')))
 
     def evaluate(height, qacc):
@@ -138,11 +137,7 @@ def resting():
         solved = constraint.solve(scene.model, data)
         return solved, constraint.residual(scene.model, data, solved), constraint.residual(scene.model, data, qacc)
 
-    return scene, compiled(evaluate, jnp.asarray(0.0), jnp.zeros(3))
-
-
-def test_the_residual_measures_the_distance_from_the_solution(resting) -> None:
-    _, run = resting
+    run = compiled(evaluate, jnp.asarray(0.0), jnp.zeros(3))
     height = jnp.asarray(-0.0005)
     solution, converged, _ = run(height, jnp.zeros(3))
     # MJX stops where its cost no longer falls; the cost is quadratic, so that this is the square root of rounding

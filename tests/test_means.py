@@ -1,14 +1,16 @@
-"""gradcheck --mean: through MuJoCo's default contact first order is biased, with the onset term it is not."""
+"""Means of first-order gradients through MJX's contact: as commands judge them, and against slopes by quadrature."""
 
 import json
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from estimators import make_estimator
 from mjx_study.cli import main
 from mjx_study.diagnose.means import check_mean, term_lines
+from mjx_study.experiment.quadrature import Line, Means, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 
@@ -47,3 +49,37 @@ def test_commands_judge_means_with_an_onset_term(capsys: pytest.CaptureFixture[s
     assert at_end["gap"] == pytest.approx(float(check.circulation.gap), rel=1e-9) and at_end["gap"] != judged["gap"]
     (line,) = term_lines([check])
     assert f"the mean of FoBG (onset) is {check.verdict}" in line and "without a reference" in line
+
+
+def measured(name: str, families: tuple[str, ...], position: np.ndarray, size: int) -> dict[str, Means]:
+    task = make_task(name)
+    line, points = Line(task), grid(position.min(), position.max(), task.sigma, size, task.noise)
+    cells, _ = family_grid(task, families, [10000.0])
+    return {cell.family: means(points, *line(points, cell.contact), position, task.sigma, task.noise) for cell in cells}
+
+
+@pytest.mark.slow
+def test_momentum_transfer() -> None:
+    """Right where the damping begins smoothly or there is none; of the wrong sign with MuJoCo's default."""
+    found = measured("momentum_transfer", ("penalty", "smooth_onset", "mujoco_default"), np.array([0.5]), 1500)
+    for family in ("penalty", "smooth_onset"):
+        here = found[family]
+        error = here.slope_error + here.first_error
+        assert np.all(np.abs(here.first - here.slope) < 3 * error + 0.01 * np.abs(here.slope))
+        assert np.all(3 * error < 0.2 * np.abs(here.slope)), "no power"
+    default = found["mujoco_default"]
+    assert default.slope < -0.9 and default.first > 0.7
+    assert np.all(default.slope_error + default.first_error < 0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["ball_wall", "ball_wall:dome"])
+def test_ball_wall(variant: str) -> None:
+    """The landing alone, short of any wall, hides the slope behind the onset of the floor's damping."""
+    families = ("penalty", "smooth_onset", "mujoco_default", "mujoco_stiff")
+    for family, here in measured(variant, families, np.array([0.2]), 2000).items():
+        assert here.slope == pytest.approx(-0.0105, rel=0.05) and here.slope_error < 1e-4
+        if family == "smooth_onset":
+            assert here.first == pytest.approx(here.slope, rel=0.02) and here.first_error < 0.01 * np.abs(here.slope)
+        else:
+            assert np.abs(here.first) < 0.1 * np.abs(here.slope)

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from estimators import AlphaOrder, Evaluation, draw, first_order, zeroth_order
-from estimators.sampling import sample_keys as keys_of_orders
+from estimators import Evaluation, first_order, zeroth_order
 from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
 from mjx_study.runtime import local_devices
 from mjx_study.simulation import dynamics
@@ -142,18 +141,6 @@ def test_evaluating_never_differentiates_the_dynamics(monkeypatch):
     both = pusher_simulator().objective(penalty(10.0)).evaluate(theta, sample_keys(7))
     np.testing.assert_allclose(alone.value, both.value, rtol=1e-12)
     np.testing.assert_array_equal(alone.score, both.score)
-
-
-def test_batches_of_an_interpolated_estimate_are_independent(simulator):
-    """Noise of the zeroth-order batch against that of the first-order batch: 50 x 200 pairs, correlation 0 +- 1e-2."""
-    objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
-    zeroth, first = draw(AlphaOrder.needs, objective, theta, jax.random.key(0), 50).values()
-    replayed = objective.evaluate(theta, keys_of_orders(jax.random.key(0), 50)[1])
-    np.testing.assert_array_equal(replayed.value, first.value)  # so its scores hold the first-order batch's noise
-    correlation = np.corrcoef(np.ravel(zeroth.score), np.ravel(replayed.score))[0, 1]
-    assert abs(correlation) < 4 / np.sqrt(50 * HORIZON)
-    # Nor is any sample of one the same as any sample of the other.
-    assert not np.intersect1d(np.ravel(zeroth.score), np.ravel(replayed.score)).size
 
 
 # Scores and baselines

@@ -149,22 +149,6 @@ def test_gradient_against_differences_mujoco_default(simulator, name):
             assert abs(ahead - 2 * value + behind) / step <= 100 * step + 4 * HORIZON * EPS * value / step
 
 
-def test_no_gradient_contains_the_jump_at_onset(simulator):
-    """Where contact begins in a jump (default impedance 0.9), differences across it grow like 1 / step.
-
-    `reversing` begins exactly at touch, so every difference straddles the onset; the gradient does not see it.
-    """
-    contact, controls = mujoco_default(), INPUTS["reversing"]
-    _, gradient = cost_and_gradient(simulator, contact, controls)
-    direction = directions(1)[0][:, None]
-    gaps = []
-    for step in (1e-4, 1e-5, 1e-6):
-        ahead, behind = (cost(simulator, contact, controls + sign * step * direction) for sign in (1, -1))
-        gaps.append(abs((ahead - behind) / (2 * step) - gradient @ direction[:, 0]))
-    np.testing.assert_allclose(np.divide(gaps[1:], gaps[:-1]), 10, rtol=0.05)
-    assert gaps[-1] > np.linalg.norm(gradient)
-
-
 @pytest.mark.parametrize("name", INPUTS)
 @pytest.mark.parametrize("stiffness", STABLE)
 def test_gradient_against_the_hand_derived_one(simulator, stiffness, name):
@@ -212,24 +196,6 @@ def test_same_keys_same_noise_in_mjx_and_reference(simulator):
         np.testing.assert_allclose(evaluated.baseline, evaluation.baseline, rtol=tolerance_value)
         for one, other in zip(differentiated.gradient, differentiation.gradient, strict=True):
             assert relative(one, other) < tolerance_gradient
-
-
-def test_stiff_samples_equal_the_reference_at_equal_impedance(simulator):
-    """At K = 1000 with noise, impedance 1e-4 already changes most gradients, by 130 % in the median; no fault.
-
-    At equal impedance they agree to rounding times a growth of the adjoint of up to 1e9.
-    """
-    theta = pusher_task().theta
-    differentiated = simulator.objective(penalty(1000.0)).differentiate(theta, sample_keys(64))
-    exact, limit = (
-        ReferenceObjective(system, tuple(START), HORIZON, SIGMA).differentiate(theta, sample_keys(64))
-        for system in (ImpedancePusher(1000.0), Pusher(1000.0))
-    )
-    pairs = zip(differentiated.gradient, exact.gradient, limit.gradient, strict=True)
-    to_exact, to_limit = np.array([(relative(one, same), relative(one, zero)) for one, same, zero in pairs]).T
-    np.testing.assert_allclose(differentiated.value, exact.value, rtol=1e-8)
-    assert np.median(to_exact) < 1e-8 and to_exact.max() < 1e-4
-    assert np.median(to_limit) > 0.1
 
 
 @pytest.mark.parametrize(("stiffness", "calmer"), [(10.0, "first"), (1000.0, "zeroth")])

@@ -148,21 +148,6 @@ def test_estimates_can_be_mapped_over_parameters():
     assert jax.tree.map(lambda leaf: None, mapped).alpha.alpha is None
 
 
-def test_estimators_are_static_arguments():
-    aobg = AlphaOrder(gamma=50.0)
-
-    @jax.jit
-    def through_closure(theta: Array) -> Array:
-        return estimate(aobg, OBJECTIVE, theta, jax.random.key(5), 10).mean
-
-    def through_argument(theta: Array, estimator: Estimator) -> Array:
-        return estimate(estimator, OBJECTIVE, theta, jax.random.key(5), 10).mean
-
-    theta = jnp.asarray(THETA)
-    static = jax.jit(through_argument, static_argnums=1)(theta, aobg)
-    np.testing.assert_array_equal(through_closure(theta), static)
-
-
 @jax.jit
 def lossy_batches() -> tuple[Evaluation, Differentiation]:
     """100 samples each; three values lost, and one gradient of a finite value."""
