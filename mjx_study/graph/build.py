@@ -70,11 +70,19 @@ def build_identity(in_numpy: bool = False) -> str:
     if in_numpy:
         return _digest(sys.version, version_of("numpy"), version_of("jaxlib"))
     return _digest(
-        compiler(), QUICKLY, WELL, _FLAGS_HERE, processor(), cuda.target(), cuda.QUICKLY, version_of("jaxlib")
+        compiler(), QUICKLY, WELL, _flags_here(), processor(), cuda.target(), cuda.QUICKLY, version_of("jaxlib")
     )
 
 
-_FLAGS_HERE: Final = ("-mcpu=native" if os.uname().machine in ("arm64", "aarch64") else "-march=native", *FLAGS)
+@functools.cache
+def _flags_here() -> tuple[str, ...]:
+    """Flags for this machine; `LIBMVEC` where glibc's functions of vectors are complete, which are then loaded."""
+    processor = "-mcpu=native" if os.uname().machine in ("arm64", "aarch64") else "-march=native"
+    try:
+        vectorial = hasattr(ctypes.CDLL("libmvec.so.1", mode=ctypes.RTLD_GLOBAL), "_ZGVdN4v_tanh")
+    except OSError:
+        vectorial = False
+    return processor, *FLAGS, *(["-DLIBMVEC"] if vectorial else [])
 
 
 def _digest(*parts: Any) -> str:
@@ -138,7 +146,7 @@ def _build(name: str, source: str) -> Any:
                     Path(folder, "kernel").write_bytes(cuda.compile_kernel(source, target.split()[1]))
                 except ValueError as error:
                     return _failed(written, "NVRTC", str(error))
-            flags = *(WELL if len(source) < LONG else QUICKLY), *_FLAGS_HERE
+            flags = *(WELL if len(source) < LONG else QUICKLY), *_flags_here()
             done = _run(*command, *flags, include, written.name, "-o", library.name, "-lm", "-ldl", folder=folder)
         if done.returncode:
             return _failed(written, shlex.join(command), done.stderr)

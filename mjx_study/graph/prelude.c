@@ -130,9 +130,32 @@ SELECT(u8, i8)
     EACH r[lane] = function(x[lane], y[lane]); \
     return r;                                  \
   }
-#define FUNCTION(name) UNARY(f64, name, name) UNARY(f32, name, name##f)
+#define EACH_LANE(name) UNARY(f64, name, name) UNARY(f32, name, name##f)
 FLOATS(f64, i64, )
 FLOATS(f32, i32, f)
+
+// Functions from glibc's libmvec for x86-64, up to 20 times as fast as each lane's, within 4 units in the last place.
+
+#define WHOLE(type, vectors, name, function)                       \
+  type _ZGV##vectors##v_##function(type);                          \
+  ONE type name##_##type(type x) { return _ZGV##vectors##v_##function(x); }
+#define WHOLE_OF(type, vectors, name, function) WHOLE(type, vectors, name, function)
+#if VECTOR == 64
+#define DOUBLES eN8
+#define SINGLES_AS_MANY dN8
+#define SINGLES eN16
+#else
+#define DOUBLES dN4
+#define SINGLES_AS_MANY bN4
+#define SINGLES dN8
+#endif
+#if !defined(LIBMVEC) || !defined(__AVX2__)
+#define FUNCTION EACH_LANE
+#elif WIDE
+#define FUNCTION(name) WHOLE_OF(f64, DOUBLES, name, name) WHOLE_OF(f32, SINGLES_AS_MANY, name, name##f)
+#else
+#define FUNCTION(name) UNARY(f64, name, name) WHOLE_OF(f32, SINGLES, name, name##f)
+#endif
 
 // Operations of integers: division by zero gives -1, with the dividend as remainder.
 

@@ -66,6 +66,7 @@ ONE mask select_bool(mask m, mask no, mask yes) { return m ? yes : no; }
 #define BINARY(type, name, function) \
   ONE type name##_##type(type x, type y) { return function(x, y); }
 #define FUNCTION(name) UNARY(f64, name, name) UNARY(f32, name, name##f)
+#define EACH_LANE FUNCTION
 #define FLOATS(type)                                                                   \
   SELECT(type)                                                                         \
   ONE type max_##type(type a, type b) { return a > b || a != a ? a : b; }              \

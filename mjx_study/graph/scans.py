@@ -46,8 +46,8 @@ def with_native_scans(function: Callable[..., Any]) -> Callable[..., Any]:
         leaves, structure = jax.tree.flatten(shape)
         closed = _without_rules(closed)
         jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(leaves), instantiate=True)
-        outputs = _evaluated(_natively, ClosedJaxpr(jaxpr, closed.consts), *jax.tree.leaves(arguments))
-        return structure.unflatten(outputs)
+        natively = partial(_natively, set())
+        return structure.unflatten(_evaluated(natively, ClosedJaxpr(jaxpr, closed.consts), *jax.tree.leaves(arguments)))
 
     return program
 
@@ -79,13 +79,22 @@ def _inlined(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
     return outputs
 
 
-def _natively(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
-    """Outputs of an operation, in which scans are replaced by native code."""
+def _natively(left: set[int], equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
+    """Outputs of an operation, in which scans are replaced by native code.
+
+    Args:
+        left: lengths of the loops that XLA has kept. On CPUs it keeps what maps their rows, too: native code has rows
+            in another order, and copying them takes longer than a small network.
+    """
     name, inner = equation.primitive.name, equation.params.get("jaxpr")
-    if name == "scan" and (loop := _native_scan(equation, inputs)) is not None:
-        return loop
+    if name == "scan":
+        length, maps = equation.params["length"], not equation.params["num_carry"]
+        stays = maps and length in left and jax.default_backend() == "cpu"
+        if not stays and (loop := _native_scan(equation, inputs)) is not None:
+            return loop
+        left.add(length)
     if name in ("jit", "pjit") and isinstance(inner, ClosedJaxpr) and _has(inner.jaxpr, "scan"):
-        return _evaluated(_natively, inner, *inputs)
+        return _evaluated(partial(_natively, left), inner, *inputs)
     _build(equation)
     return bind_whole(equation, inputs)
 
