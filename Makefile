@@ -69,7 +69,7 @@ test-all: $(STAMP) ## Run all tests, and those of test-newer-jax
 NEWER_PYTHON ?= $(shell for each in python3.13 python3.12 $$HOME/.pyenv/versions/3.1[32].*/bin/python; do \
 	$$each -c '' 2>/dev/null && echo $$each && break; done)
 NEWEST := .venv-newest
-NEWEST_TESTS := compiled.py graph.py objective.py batches.py bench.py bias.py optimise.py cluster.py
+NEWEST_TESTS := compiled.py graph.py objective.py batches.py bench.py means.py optimise.py cluster.py
 test-newer-jax: ## Run the tests of devices on the newest JAX, if there is a Python 3.12 or 3.13 (NEWER_PYTHON=path)
 	@python=$(NEWER_PYTHON); if [ -z "$$python" ]; then \
 		echo 'NOT TESTED on the newest JAX: no Python 3.12 or 3.13 here; NEWER_PYTHON=path names one'; else \

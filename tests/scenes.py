@@ -42,12 +42,9 @@ def slider(condim: int = 3, friction: float = 0.5, mass: float = 1.0, height: fl
     )
 
 
-FALLING: Final = floor_scene(
-    '<body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1" condim="1"/></body>',
-    option(5e-4),
-    'condim="1"',
-)
+DROP: Final = '<body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1" condim="1"/></body>'
 """A ball above the floor, or in it, that can only move up and down; without friction."""
+FALLING: Final = floor_scene(DROP, option(5e-4), 'condim="1"')
 
 FREE_BOX: Final = '<body pos="0 0 .0998"><freejoint/><geom name="box" type="box" size=".1 .12 .1" mass="1"/></body>'
 
@@ -160,6 +157,11 @@ def scene_of(source: str, name: str = "test", **options: Any) -> Scene:
 def compiled(function: Callable[..., Any], *examples: Any) -> Callable[..., Any]:
     """The function compiled for these arguments with the least optimisation."""
     return jax.jit(function).lower(*examples).compile(compiler_options={"xla_backend_optimization_level": "0"})
+
+
+def run(function: Callable[..., Any], *arguments: Any) -> Any:
+    """What the function gives, compiled for these arguments alone."""
+    return jax.device_get(compiled(function, *arguments)(*arguments))
 
 
 def in_both_modes(function: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, Any, Any]]:

@@ -1,7 +1,6 @@
 """Steps of more degrees of freedom than XLA unrolls, in native code: the engine's, with their derivatives."""
 
-from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -10,18 +9,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from experiments.drop_in import MODELS
 from experiments.values import EDGES, compared
 from mjx_study.graph import operation, scalars
 from mjx_study.graph.build import known_libraries
 from mjx_study.graph.native import SWITCH, native_identity, native_summary
-from mjx_study.simulation import constraint, dynamics
+from mjx_study.simulation import dynamics
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED
 from mjx_study.simulation.observation import observed
-from mjx_study.simulation.scene import Scene, load_scene, put_scene
+from mjx_study.simulation.scene import Scene, put_scene
 from tests.scenes import compiled
 
 pytestmark = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
@@ -262,15 +260,10 @@ def test_a_ball_on_a_height_field(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(slopes[same], expected_slopes[same], rtol=0, atol=1e-8 * scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "to_engine"),
-    [
-        ("quadruped", 1e-11),
-        pytest.param("arm", 1e-11, marks=pytest.mark.slow),
-        pytest.param("humanoid", 1e-11, marks=pytest.mark.slow),
-        pytest.param("barkour_v0", 2e-5, marks=pytest.mark.slow),
-        pytest.param(EDGES, 1e-11, marks=pytest.mark.slow),
-    ],
+    [("quadruped", 1e-11), ("arm", 1e-11), ("humanoid", 1e-11), ("barkour_v0", 2e-5), (EDGES, 1e-11)],
 )
 def test_steps_and_derivatives_are_those_of_stock_mjx(name: str, to_engine: float) -> None:
     """From states in contact, and in the C engine's distance, which MJX's edges of height fields make larger."""
@@ -280,43 +273,3 @@ def test_steps_and_derivatives_are_those_of_stock_mjx(name: str, to_engine: floa
     assert max(found["step"]["ours - stock"]) < 1e-11 and max(found["slopes"]) < 1e-6
     assert max(found["step"]["ours - engine"]) < to_engine
     assert name != "barkour_v0" or max(found["step"]["ours - engine"]) > 1e-8
-
-
-def quadruped_of_mjx() -> Scene:
-    """MJX's `barkour_v0` on its height field, with a budget of the solver that does not end it."""
-    host = mujoco.MjModel.from_xml_path(str(MODELS["`barkour_v0`, a quadruped"]))
-    host.opt.iterations, host.opt.ls_iterations = 100, 50
-    return put_scene(host, "barkour_v0")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("load", [partial(load_scene, "quadruped"), quadruped_of_mjx])
-def test_a_quadrupeds_steps_are_those_of_mjxs_arrays(load: Callable[[], Scene]) -> None:
-    """Values and adjoints to rounding, in and out of contact, against JAX's operations with the same solver."""
-    scene = load()
-    point, draw = states(scene.host, 64), np.random.default_rng(1)
-    adjoints = [draw.normal(size=each.shape) for each in point[:2]]
-
-    def by_arrays(*point):
-        qpos, qvel, control, warmstart = point
-        state = State(qpos, qvel, jnp.zeros(0), warmstart)
-        return dynamics._values(scene, constraint.newton, scene.model, state, control)
-
-    def by_tape(adjoints, qacc, *point):
-        def after(qpos, qvel, control):
-            return dynamics._at_solution(scene, scene.model, qacc, qpos, qvel, jnp.zeros(0), control)[:2]
-
-        return jax.vjp(after, *point)[1](tuple(adjoints))
-
-    found = compiled(jax.vmap(lambda *point: advanced(scene, *point)), *point)(*point)
-    expected = compiled(jax.vmap(by_arrays), *point)(*point)
-    assert max(np.max(found[1]), np.max(expected[1])) < 1e-12
-    for name in ("qpos", "qvel", "warmstart"):
-        one, other = (np.asarray(getattr(each[0], name)) for each in (found, expected))
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * np.max(np.abs(other)))
-    pull = jax.vmap(lambda adjoints, *point: pulled(scene, adjoints, *point))
-    tape = jax.vmap(by_tape)
-    gradients = compiled(pull, adjoints, *point)(adjoints, *point)
-    at = adjoints, expected[0].warmstart, *point[:3]
-    for one, other in zip(gradients, compiled(tape, *at)(*at), strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9 * np.max(np.abs(other)))

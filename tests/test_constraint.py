@@ -18,7 +18,6 @@ from tests.scenes import (
     condims,
     floor_scene,
     option,
-    plain_warm_start,
     scene_of,
     slider,
     split,
@@ -128,9 +127,8 @@ def test_the_elliptic_law_is_the_gradient_of_a_convex_cost() -> None:
     assert sliding >= 4
 
 
-@pytest.fixture(scope="module")
-def resting():
-    """A ball that presses on the plane, and the residual over acceleration and height."""
+def test_the_residual_measures_the_distance_from_the_solution() -> None:
+    """Of a ball that presses on the plane."""
     scene = scene_of(floor_scene(slider(3), option(extra='cone="elliptic"')))
 
     def evaluate(height, qacc):
@@ -139,11 +137,7 @@ def resting():
         solved = constraint.solve(scene.model, data)
         return solved, constraint.residual(scene.model, data, solved), constraint.residual(scene.model, data, qacc)
 
-    return scene, compiled(evaluate, jnp.asarray(0.0), jnp.zeros(3))
-
-
-def test_the_residual_measures_the_distance_from_the_solution(resting) -> None:
-    _, run = resting
+    run = compiled(evaluate, jnp.asarray(0.0), jnp.zeros(3))
     height = jnp.asarray(-0.0005)
     solution, converged, _ = run(height, jnp.zeros(3))
     # MJX stops where its cost no longer falls; the cost is quadratic, so that this is the square root of rounding
@@ -152,19 +146,6 @@ def test_the_residual_measures_the_distance_from_the_solution(resting) -> None:
     far, near = (float(run(height, solution + distance * away)[2]) for distance in (1e-2, 1e-3))
     assert far > 1e-4
     assert far / near == pytest.approx(10, rel=0.05)  # linear in the distance
-
-
-@pytest.mark.slow
-def test_a_short_budget_shows_in_the_residual() -> None:
-    case, residuals = CASES["mechanism"], []
-    for iterations in (1, 100):
-        scene = scene_of(case.source.replace('iterations="100" ls', f'solver="CG" iterations="{iterations}" ls'))
-        point = start_point(case, scene)
-        with plain_warm_start():
-            step = compiled(lambda x, scene=scene: step_flat(scene, scene.model, x, jnp.zeros(scene.host.nv))[2], point)
-        residuals.append(float(step(point)))
-    assert residuals[0] > 1e-3
-    assert residuals[1] < 1e-6  # where conjugate gradients no longer lower the cost
 
 
 def test_the_residual_of_nothing_is_zero() -> None:

@@ -105,18 +105,6 @@ def test_the_penalty_limit_is_a_spring_and_a_damper(normal_acceleration) -> None
             assert measured == pytest.approx(force, rel=1e-3)
 
 
-def test_the_penalty_adds_to_other_forces_as_the_impedance_falls(normal_acceleration) -> None:
-    """a_1 - (a_0 + F / m) falls linearly with the impedance: tenfold per decade."""
-    _, scene, acceleration = normal_acceleration
-    spring = STIFFNESS * PENETRATION / MASS
-    free = -9.0
-    gaps = [acceleration(in_units(scene, d), 0.0, free) - (free + spring) for d in (1e-2, 1e-3, 1e-4)]
-    # the next order of the expansion is g d: 10 percent at most in the first decade, 1 percent in the second
-    assert gaps[0] / gaps[1] == pytest.approx(10, rel=0.1)
-    assert gaps[1] / gaps[2] == pytest.approx(10, rel=0.01)
-    assert gaps[2] == pytest.approx(0, abs=1e-4 * 12 * (spring - free))
-
-
 @pytest.mark.parametrize("impedance", [1e-3, 0.5, 0.9])
 def test_the_law_of_contact(normal_acceleration, impedance: float) -> None:
     """a_1 = (1 - d) a_0 - b v - k r, exact for a single normal row; with its gain for a pyramid."""
@@ -147,10 +135,7 @@ def test_refsafe_clips_at_two_timesteps(normal_acceleration) -> None:
         clipped = contact_model((0.75 * limit, 4.0), constant(0.8), scene=scene)
     safe = contact_model((limit, 4.0), constant(0.8), scene=scene)
     assert acceleration(clipped, SPEED, 0.0) == acceleration(safe, SPEED, 0.0)
-
-
-def test_refsafe_off_does_not_clip() -> None:
-    contact_model((0.009, 1.0), scene=load_scene("pusher"))  # less than two of its timesteps; warnings are errors here
+    contact_model((0.009, 1.0), scene=load_scene("pusher"))  # refsafe is off there; warnings are errors here
 
 
 @pytest.mark.parametrize(("stiffness", "damping"), [(1e3, 0.0), (2.5, 7.0), (1e7, 1e3)])
@@ -158,6 +143,8 @@ def test_units_round_trip(stiffness: float, damping: float) -> None:
     solref = solref_from_stiffness(stiffness, damping, effective_mass=0.05)
     assert solref == (-stiffness / 0.05, -damping / 0.05)
     assert stiffness_from_solref(solref, effective_mass=0.05) == pytest.approx((stiffness, damping), rel=1e-15)
+    with pytest.raises(ValueError, match="mixes signs"):
+        stiffness_from_solref((-1.0, 1.0), effective_mass=1.0)
     if damping:
         k, b = -solref[0], -solref[1]
         positive = (2 / b, b / (2 * math.sqrt(k)))
@@ -213,37 +200,20 @@ def test_what_is_not_given_stays_the_mjcfs() -> None:
         assert getattr(model, name) is getattr(scene.model, name)
 
 
-def test_contact_models_stack_under_vmap() -> None:
-    scene = scene_of(PAIRED)
-    models = [contact_model((-k, -1.0), margin=m, scene=scene) for k, m in ((100.0, 0.0), (300.0, 0.001))]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
-    applied = jax.jit(jax.vmap(lambda contact: apply_contact(scene.model, contact), axis_size=2))(stacked)
-    for index, contact in enumerate(models):
-        alone = apply_contact(scene.model, contact)
-        for name in ("geom_solref", "pair_solref", "geom_solimp", "pair_solimp", "geom_margin", "pair_margin"):
-            np.testing.assert_array_equal(getattr(applied, name)[index], getattr(alone, name))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"solref": (-1.0, 1.0)}, "mixes signs and MuJoCo would fall back"),
-        ({"solref": (1.0, -1.0)}, "mixes signs"),
-        ({"solref": (0.02, 0.0)}, "mixes signs"),
         ({"solref": (1.0,)}, "solref must be two finite numbers"),
         ({"solref": (math.inf, 1.0)}, "solref must be two finite numbers"),
         ({"solimp": (0.9, 0.95)}, "solimp must be five finite numbers"),
-        ({"solimp": (0.9, 0.95, math.nan, 0.5, 2.0)}, "solimp must be five finite numbers"),
         ({"solimp": (0.0, 0.95, 0.001, 0.5, 2.0)}, "solimp's d_0 is 0.0, and MuJoCo would clip it"),
         ({"solimp": (0.9, 1.0, 0.001, 0.5, 2.0)}, "solimp's d_width is 1.0"),
-        ({"solimp": (0.9, 0.95, 0.001, 0.0, 2.0)}, "solimp's midpoint is 0.0"),
         ({"solimp": (0.9, 0.95, 0.0, 0.5, 2.0)}, "solimp's width must be positive, in m; got 0.0"),
         ({"solimp": (0.9, 0.95, 0.001, 0.5, 0.5)}, "solimp's power must be at least 1, got 0.5"),
-        ({"friction": (0.5, 0.1)}, "friction must be three numbers >= 0"),
         ({"friction": (0.5, -0.1, 0.0)}, "friction must be three numbers >= 0"),
         ({"friction": (math.nan, 0.1, 0.0)}, "friction must be three numbers >= 0"),
         ({"margin": -0.1}, "margin must be >= 0 m, got -0.1"),
-        ({"margin": math.nan}, "margin must be >= 0 m, got nan"),
     ],
 )
 def test_bad_contact_models_are_refused(change, message: str) -> None:
@@ -257,13 +227,9 @@ def test_bad_contact_models_are_refused(change, message: str) -> None:
     [
         ({"stiffness": 0.0}, "stiffness must be positive and finite, in N/m; got 0.0"),
         ({"stiffness": math.inf}, "stiffness must be positive and finite"),
-        ({"stiffness": math.nan}, "stiffness must be positive and finite"),
         ({"effective_mass": 0.0}, "effective mass must be positive and finite, in kg; got 0.0"),
-        ({"effective_mass": math.inf}, "effective mass must be positive and finite"),
         ({"damping": -1.0}, "damping must be >= 0 and finite, in N s/m; got -1.0"),
-        ({"damping": math.inf}, "damping must be >= 0 and finite"),
         ({"dampratio": -1.0}, "damping ratio must be >= 0 and finite; got -1.0"),
-        ({"dampratio": math.nan}, "damping ratio must be >= 0 and finite"),
         ({"damping": 1.0, "dampratio": 1.0}, "give damping in N s/m or a damping ratio, not both"),
     ],
 )
@@ -272,13 +238,10 @@ def test_bad_units_are_refused(arguments, message: str) -> None:
         solref_from_stiffness(**{"stiffness": 1.0, "effective_mass": 1.0, **arguments})
 
 
-def test_mixed_signs_have_no_stiffness() -> None:
-    with pytest.raises(ValueError, match="mixes signs"):
-        stiffness_from_solref((-1.0, 1.0), effective_mass=1.0)
-
-
 @pytest.mark.parametrize("name", FAMILIES)
 def test_every_family_builds(name: str) -> None:
+    with pytest.raises(ValueError, match="unknown contact family 'rubber'; choose from penalty, impedance, mujoco"):
+        family_model("rubber", load_scene("pusher"), stiffness=1.0, effective_mass=1.0)
     scene, family = load_scene("pusher"), FAMILIES[name]
     mass = effective_mass(scene, "pusher", "slider")
     if family.smoothing:
@@ -305,11 +268,6 @@ def test_every_family_builds(name: str) -> None:
     assert float(damped.solref[1]) == pytest.approx(-0.3 / mass, rel=1e-15)
     with pytest.raises(ValueError, match=f"contact family '{name}' needs a stiffness in N/m"):
         family_model(name, scene, effective_mass=mass)
-
-
-def test_an_unknown_family_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown contact family 'rubber'; choose from penalty, impedance, mujoco"):
-        family_model("rubber", load_scene("pusher"), stiffness=1.0, effective_mass=1.0)
 
 
 def test_mujocos_own_defaults_are_the_constants() -> None:

@@ -218,20 +218,6 @@ def test_somebody_elses_environment_has_gradients_inside_and_only_there() -> Non
 
 
 @pytest.mark.slow
-def test_a_trace_of_stock_mjx_is_not_used_again() -> None:
-    """With one iteration stock has a derivative, NaN where nothing slides: each side keeps its own."""
-    environment = Environment('cone="elliptic"')
-    options = environment.model.opt.replace(iterations=1, ls_iterations=4)
-    environment.model = environment.model.replace(opt=options)
-    gradient = jax.jit(jax.grad(environment.rollout, argnums=1))
-    point = jnp.array([0.02, 1.0]), jnp.array(0.3)
-    before = float(gradient(*point))
-    with differentiable_mjx():
-        inside = float(gradient(*point))
-    assert np.isnan([before, float(gradient(*point))]).all() and 0 < inside < 0.04
-
-
-@pytest.mark.slow
 def test_the_context_is_a_decorator_and_may_be_nested() -> None:
     environment = Environment()
 

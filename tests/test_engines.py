@@ -13,11 +13,11 @@ import pytest
 
 from experiments import ROOT
 from experiments.engines import __main__ as command
-from experiments.engines import catalog, certify, references, worker
+from experiments.engines import catalog, certify, references
 from experiments.engines.adapters import mujoco_family
 from experiments.engines.judge import combined, measure, verdict
 from experiments.engines.page import CELLS, CHECKS, PAGE, cells, tables
-from experiments.engines.scenes import RADIUS, SCENES, TIMESTEPS, Rollout, mjcf
+from experiments.engines.scenes import RADIUS, SCENES, TIMESTEPS, mjcf
 from experiments.pages import replace_tables
 
 SMALL = {"grid": 100, "strata": 100, "points": 20}
@@ -42,7 +42,7 @@ RIGHT: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({}, "right"),
+        ({}, "right"), ({"mean": math.nan}, "unknown"), ({"mean": math.nan, "nan_share": 1.0}, "none"),
         ({"mean": 2.0, "mean_of_strata": 2.0}, "biased"),
         ({"mean": 1.05, "mean_of_strata": 1.05}, "close"),
         ({"mean": 1.05, "mean_of_strata": 1.05, "mean_error": 0.03}, "unknown"),
@@ -50,14 +50,12 @@ RIGHT: dict[str, Any] = {
         ({"point_share": 0.0, "mean": 2.0, "mean_of_strata": 2.0}, "wrong"),
         ({"slope_by_differences": 1.04}, "unknown"),
         ({"mean": 2.0, "mean_of_strata": 2.6}, "unknown"),
-        ({"mean": math.nan}, "unknown"),
-        ({"mean": math.nan, "nan_share": 1.0}, "none"),
         ({"state": [[0.3, 0, 0.04]]}, "no contact"),
         ({"scene": "pendulum", "state": [[0.3, 0, 2.3]]}, "no joint"),
         ({"scene": "pendulum", "state": [[0.3, 0, 1.6]]}, "right"),
         (dict.fromkeys(("slope", "slope_by_differences", "mean", "mean_of_strata"), 1e-8), "at rest"),
     ],
-)
+)  # fmt: skip
 def test_verdicts(changes: dict[str, Any], said: str) -> None:
     assert verdict(RIGHT | changes) == said
     assert combined([RIGHT | changes] * 2) == said
@@ -83,16 +81,6 @@ def test_the_page_says_what_the_data_give() -> None:
     assert f"Of {len(every)} cells, {lacking} have [no numbers]" in text
 
 
-def test_times_and_versions_are_those_of_the_cells() -> None:
-    old = RIGHT | {"seconds_per_gradient": 0.0123}
-    found = {("brax_spring", "toss", 0.005): old | {"versions": {"jax": "1.2", "mujoco": "3.4"}}}
-    found |= {("brax_spring", "wall", step): old for step in TIMESTEPS}
-    said, label = tables(found, {}), catalog.ENGINES["brax_spring"].label
-    pins = " ".join(catalog.ENVIRONMENTS["brax"].packages)
-    assert said["versions"].splitlines()[2:] == [f"| {label} | MuJoCo 3.4, JAX 1.2 (1); not recorded (2) | {pins} |"]
-    assert said["times"].splitlines()[2:] == [f"| {label} | 12 | - | - | 12 | - | - | - | - |"]
-
-
 def test_accusing_cells_are_accused_under_other_noise() -> None:
     checks, found = cells(CHECKS), cells(CELLS)
     assert set(checks) == set(command.CHECKED)
@@ -114,41 +102,6 @@ def test_brax_from_higher_is_what_others_measured(
     cell = cells(CHECKS)[engine, command.HIGH, step]
     assert [cell["slope"], cell["mean"]] == pytest.approx([slope, mean], rel=0.02)
     assert cell["derivative"] == pytest.approx(at_point, abs=6e-6)
-
-
-def test_a_variant_has_a_name_and_a_scene_of_its_own(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    seen = []
-
-    def rollouts(scene, timestep, variant):
-        seen.append((scene.sigma, timestep, variant))
-        return lambda thetas: Rollout(thetas, np.ones(len(thetas)), np.tile([0.0, 0.0, 1.0], (len(thetas), 1, 1)))
-
-    monkeypatch.setattr(mujoco_family, "build", rollouts)
-    for name in ("toss", command.HALF):
-        monkeypatch.setattr(sys, "argv", ["worker", "mjx", name, "0.005", "quick"])
-        worker.main()
-    assert seen == [(SCENES["toss"].sigma / share, 0.005, "forward") for share in (1, 2)]
-    written = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [verdict(each) for each in written] == ["right"] * 2 and written[1]["scene"] == command.HALF
-
-
-@pytest.mark.parametrize(("other", "again"), [(1.0, False), (1.2, True), (20.0, False), (math.nan, False)])
-def test_what_is_undecided_is_measured_again_if_that_may_decide(
-    other: float, again: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    def measured(simulate, scene, counts, *, single):
-        asked.append(counts)
-        return RIGHT | {"mean_of_strata": other}
-
-    monkeypatch.setattr(worker, "measure", measured)
-    monkeypatch.setattr(mujoco_family, "build", lambda *_: None)
-    monkeypatch.setattr(sys, "argv", ["worker", "mjx", "toss", "0.005"])
-    worker.main()
-    assert asked == [worker.MANY, worker.MORE][: 1 + again]
 
 
 @pytest.mark.parametrize("step", TIMESTEPS)
@@ -214,21 +167,6 @@ def test_a_cell_beyond_the_limit_has_this_as_its_reason_and_waits_for_a_higher_o
     found = cells(data)
     assert set(found) == {("mjx", scene, 0.005) for scene in ("toss", "wall")}
     assert "| toss at 5 ms | no result within 0.01 minutes |" in tables(found, {})["reasons"]
-
-
-def test_cells_of_other_files_are_added_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    line = '{"engine": "mjx", "scene": "toss", "timestep": 0.005}\n'
-    (tmp_path / "data").write_text(line)
-    (tmp_path / "more").write_text(line + line.replace("toss", "push"))
-    monkeypatch.setattr(command, "CELLS", tmp_path / "data")
-    command.merge([tmp_path / "more", tmp_path / "more"])
-    assert (tmp_path / "data").read_text() == line + line.replace("toss", "push")
-
-
-def test_environments_are_pinned_and_every_engine_has_one() -> None:
-    packages = [package for each in catalog.ENVIRONMENTS.values() for package in each.packages]
-    assert packages and all("==" in package or "<" in package for package in packages)
-    assert {engine.environment for engine in catalog.ENGINES.values()} == set(catalog.ENVIRONMENTS)
 
 
 FREE_FLIGHT = """

@@ -10,7 +10,6 @@ from mjx_study import caches
 from mjx_study.experiment import plan as plan_module
 from mjx_study.storage import manifest as document
 from tests.fuzz import FUZZERS, flips, fuzz, studies
-from tests.fuzz.__main__ import BEGIN, END, markdown, put_into
 from tests.fuzz.answers import Row, TooSlow, WrongError, answer
 from tests.fuzz.forgeries import FORGERIES
 from tests.fuzz.planning import fuzzed_folder
@@ -52,17 +51,6 @@ def test_every_wrong_answer_is_counted() -> None:
     assert row.inputs == 4 and len(row.wrong) == 3 and row.wrong[0] == "options: ['compare']: WrongError a"
     with pytest.raises(KeyboardInterrupt), row.counting(["compare"]):
         raise KeyboardInterrupt
-
-
-def test_the_table_goes_between_its_marks(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{BEGIN}old\n{END}after\n")
-    table = markdown([Row("options", 1200, wrong=["a", "b", "c"]), Row("files", 7)])
-    put_into(page, table)
-    put_into(page, table)
-    assert page.read_text() == f"before\n{BEGIN}\n{table}\n{END}after\n"
-    assert table.splitlines()[0] == "1,207 inputs, 3 answered wrongly."
-    assert table.splitlines()[-2:] == ["| options | 1200 | 3 |", "| files | 7 | 0 |"]
 
 
 @pytest.fixture

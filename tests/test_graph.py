@@ -290,15 +290,6 @@ def test_what_is_too_large_is_left_as_it_is(monkeypatch, most):
     assert _operations(lambda x: unrolled(function, x), ROW) == _operations(function, ROW)
 
 
-def test_what_is_too_large_stays_so_when_its_partial_is_made_anew(monkeypatch):
-    monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", 3)
-    monkeypatch.setattr(scalars, "MOST_NATIVE", 3)
-    function = lambda power, table, x: table @ jnp.cos(x) ** power  # noqa: E731
-    for _ in range(2):
-        found = jax.jit(lambda x: unrolled(partial(function, 2), TABLE, x))(ROW)
-        np.testing.assert_allclose(found, function(2, TABLE, ROW), rtol=1e-14)
-
-
 def test_a_function_is_written_out_once_for_arguments_of_equal_content(monkeypatch):
     written = []
     out = scalars.capture
@@ -319,12 +310,6 @@ def test_a_function_is_written_out_once_for_arguments_of_equal_content(monkeypat
     monkeypatch.setattr(scalars, "MOST_KEPT", 1)
     at(ROW, power=4)
     assert len(written) == 5 and len(scalars._CAPTURED) == 1
-
-
-def test_without_anything_traced_the_function_is_called():
-    seen = []
-    unrolled(lambda x: seen.append(x), ROW)
-    assert seen[0] is ROW
 
 
 def test_constants_stay_out_of_what_is_traced():

@@ -8,7 +8,7 @@ import pytest
 from mujoco.mjx._src import math as mjx_math
 from scipy.spatial.transform import Rotation
 
-from mjx_study.simulation import dynamics, integration
+from mjx_study.simulation import integration
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import integrate_position, rotate_quaternion
 from tests.scenes import central_jacobian, compiled, scene_of, split, step_flat
@@ -110,11 +110,6 @@ def test_every_joint_moves_as_in_mujoco() -> None:
     np.testing.assert_allclose(ours, expected, atol=3e-15)
 
 
-def test_no_joint_no_motion() -> None:
-    host = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
-    assert integrate_position(host, jnp.zeros(0), jnp.zeros(0), 0.1).shape == (0,)
-
-
 @pytest.fixture(scope="module")
 def floating():
     """Our step; Jacobians of it and of MJX's over (qpos, qvel) at rest, and their values."""
@@ -159,22 +154,3 @@ def test_mjx_still_loses_this_derivative(floating) -> None:
     scene, _, _, ((_, stock), _) = floating
     lost = [float(stock[row, column]) for row, column in angular(scene)]
     assert lost == [0.0] * 6, f"MJX now differentiates rotations at rest ({lost}): say so where its fault is described"
-
-
-@pytest.mark.slow
-def test_a_torque_from_rest_is_seen_over_several_steps() -> None:
-    """A rotation built up from rest depends on the torque; each step's derivative has to be right."""
-    text = f"""<mujoco><option timestep="{TIMESTEP}" gravity="0 0 0"/><worldbody><body><joint name="ball" type="ball"/>
-      <geom type="box" size=".1 .2 .3" mass="1"/></body></worldbody>
-      <actuator><motor joint="ball" gear="1 0 0"/></actuator></mujoco>"""
-    scene = scene_of(text)
-    inertia, horizon = float(scene.host.body_inertia[1, 0]), 10
-
-    def orientation(torque):
-        start = dynamics.initial_state(scene)
-        states, _, _ = dynamics.rollout(scene, scene.model, start, lambda _, __: torque[None], horizon)
-        return states.qpos[-1, 1]
-
-    # about one axis: sin(angle / 2), angle = h^2 torque / I * (1 + 2 + ... + H)
-    slope = TIMESTEP**2 / inertia * horizon * (horizon + 1) / 2 / 2
-    assert float(jax.jit(jax.grad(orientation))(jnp.asarray(0.0))) == pytest.approx(slope, rel=1e-12)

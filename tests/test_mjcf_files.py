@@ -11,7 +11,6 @@ import pytest
 
 from mjx_study.simulation import mjcf_compile
 from mjx_study.simulation.mjcf_files import DEEPEST
-from mjx_study.simulation.mjcf_text import Element, elements
 from mjx_study.simulation.scene import SceneError, load_model, models_folder, put_scene
 from tests.faults import deadline
 
@@ -70,7 +69,6 @@ def test_non_regular_files_are_never_opened(folder: Path, body: str) -> None:
     [
         ("<asset><model name='m' file='mine.xml'/></asset><worldbody><attach model='m' prefix='a'/></worldbody>",
          "mine.xml contains itself: it is included or attached again inside of itself"),
-        ("<include file='mine.xml'/>", "mine.xml contains itself"),
         ("<include file='0.xml'/>", f"is the end of a chain of files, each in the one before, of over {DEEPEST}"),
         ("<asset><model name='m' file='0.attach'/></asset><worldbody><attach model='m'/></worldbody>",
          r"attach asks for \S+ elements, with those of <replicate>, <composite>, <flexcomp> and <attach>; the limit"),
@@ -102,7 +100,6 @@ def test_files_that_cannot_be_read(folder: Path, body: str, says: str) -> None:
     [
         ("<worldbody><geom size='.1' friction='nan 0 0'/></worldbody>", "friction of <geom> must be finite, got 'na"),
         ("<option gravity='0 0 1e400'/>", "gravity of <option> must be finite, got '0 0 1e400'"),
-        ("<default><joint range='-INF 1'/></default>", "range of <joint> must be finite, got '-INF 1'"),
         ("<custom><numeric name='n' data='1 nan'/></custom>", "data of <numeric> must be finite"),
         ("<keyframe><key qpos='0 0 0 1 0 0 nan'/></keyframe>", "qpos of <key> must be finite"),
         ("<worldbody><body><freejoint/><geom size='1e308'/></body></worldbody>", "of the compiled model is not finite"),
@@ -148,8 +145,7 @@ def test_elements_are_counted_with_their_copies(folder: Path, body: str, element
         (b"<mujoco><!-- <size nkey='1000000000'/> -->" + BODY.encode() + b"</mujoco>", True),
         (b"<mujoco><custom><text name='t' data='<size/>'/></custom>" + BODY.encode() + b"</mujoco>", True),
         (f"<mujoco>{BODY}</mujoco>".encode("utf-16"), False),
-        (b"<mujoco><worldbody>" + b"<body>" * 600, False),
-        (b"<html/>", False), (b"", False), (b"\0", False), (b"hello", False),
+        (b"<mujoco><worldbody>" + b"<body>" * 600, False), (b"<html/>", False), (b"", False),
     ],
 )  # fmt: skip
 def test_the_parser_is_as_lenient_as_mujocos(folder: Path, content: bytes, accepted: bool) -> None:
@@ -158,16 +154,6 @@ def test_the_parser_is_as_lenient_as_mujocos(folder: Path, content: bytes, accep
     else:
         (folder / "mine.xml").write_bytes(content)
         assert load_model("mine.xml").nbody == mujoco.MjModel.from_xml_path("mine.xml").nbody == 2
-
-
-def test_elements_of_a_text() -> None:
-    text = b"<a b = '1'c=\"&lt;&#65;&#x42;&nope;\"><!-- <x/> --><![CDATA[<x/>]]><?x <x/> ?><d/>a & b</a\n>\0<x/>"
-    assert list(elements(text)) == [
-        Element("a", {"b": "1", "c": "<AB&nope;"}),
-        Element("d", {}),
-        Element("d", {}, ends=True),
-        Element("a", {}, ends=True),
-    ]
 
 
 @pytest.mark.parametrize("name", ["pusher", "gripper"])

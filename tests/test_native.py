@@ -19,7 +19,6 @@ from mujoco import mjx
 
 import mjx_study
 from mjx_study import runtime
-from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.graph import build, c, cuda, native, random
 from mjx_study.graph.function import capture
 from mjx_study.graph.native import SWITCH, computes_steps, native_identity, native_summary
@@ -27,7 +26,6 @@ from mjx_study.graph.nodes import ELEMENTWISE
 from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation.dynamics import initial_state, step
 from mjx_study.simulation.scene import put_scene
-from mjx_study.tasks import make_task
 from tests.test_graph import FUNCTIONS, ROW
 
 pytestmark = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
@@ -89,10 +87,7 @@ def compare(function, *points, rtol=1e-12, exact=False):
 
 
 def test_every_operation_is_covered():
-    others = {"not", "copysign"} - ELEMENTWISE
-    named = {*FLOATS, *PAIRS, *WHOLE} - {"of one", "one of three", "booleans"}
-    named |= {"not", "shift_left", "shift_right_logical"}
-    assert ELEMENTWISE - named == set() and not others - {"copysign"}
+    assert {*FLOATS, *PAIRS, *WHOLE, "not", "shift_left", "shift_right_logical"} >= ELEMENTWISE
 
 
 @pytest.mark.parametrize("name", FLOATS)
@@ -205,24 +200,6 @@ def test_batches_of_batches_and_what_does_not_vary():
             np.testing.assert_allclose(ours, theirs, rtol=1e-15)
 
 
-def test_without_jit_and_without_a_batch():
-    function = lambda x: x**2 + 1  # noqa: E731
-    np.testing.assert_allclose(jax.vmap(lambda x: unrolled(function, x))(jnp.asarray(ROW)), ROW**2 + 1)
-    np.testing.assert_allclose(jax.jit(lambda x: unrolled(function, x))(ROW), ROW**2 + 1)
-
-
-def test_second_derivatives_in_a_scan_and_a_checkpoint():
-    function = lambda x: jnp.sin(x) * x[::-1] ** 3  # noqa: E731
-
-    def total(use, x):
-        step = jax.checkpoint(lambda x, _: (use(x), None))
-        return jnp.sum(lax.scan(step, x, None, length=3)[0])
-
-    here = partial(total, lambda x: unrolled(function, x))
-    for order in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
-        np.testing.assert_allclose(jax.jit(order(here))(ROW), order(partial(total, function))(ROW), rtol=1e-11)
-
-
 @pytest.fixture
 def folder(monkeypatch, tmp_path):
     """An empty cache of libraries, in a process that knows none."""
@@ -281,11 +258,6 @@ def test_a_failing_compiler_is_reported_and_done_without(folder, monkeypatch, ca
     monkeypatch.setattr(native, "library_ready", lambda name: False)
     found = jax.jit(jax.vmap(lambda x: unrolled(lambda x: x**3 + 7, x)))(ROW)
     np.testing.assert_allclose(found, ROW**3 + 7)
-
-
-def test_what_cannot_be_loaded_is_reported(folder, capsys):
-    assert build._loaded("mjx_study_nothing", b"no library") is None
-    assert "mjx-study: native code cannot be loaded, steps run through XLA:" in capsys.readouterr().err
 
 
 ALONE = """
@@ -376,33 +348,6 @@ def test_the_page_shows_what_is_written():
     exec(python, names)
     written = c.source_of(capture(names["push"], jax.ShapeDtypeStruct((2,), float), most=99))
     assert f"{{ ENTER\n{shown}}}\n" in written
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["pusher", *(pytest.param(each, marks=pytest.mark.slow) for each in sorted({*TASK_DESCRIPTIONS} - {"pusher"}))],
-)
-def test_steps_and_their_derivatives(monkeypatch, name):
-    task = make_task(name)
-    scene, draw = task.scene, np.random.default_rng(0)
-    start = initial_state(scene)
-    controls = jnp.asarray(draw.normal(size=(9, 12, scene.host.nu)))
-
-    def total(controls):
-        def advance(state, u):
-            after = step(scene, scene.model, state, u)[0]
-            return after, after
-
-        state, states = lax.scan(advance, start, controls)
-        return jnp.sum(state.qpos) + jnp.sum(state.qvel), states
-
-    found = []
-    for switch in ("1", "0", "xla"):
-        monkeypatch.setenv(SWITCH, switch)
-        found.append(jax.tree.leaves(jax.jit(jax.vmap(jax.value_and_grad(total, has_aux=True)))(controls)))
-    for *ours, theirs in zip(*found, strict=True):
-        for each in ours:
-            np.testing.assert_allclose(each, theirs, rtol=0, atol=1e-12 * np.max(np.abs(theirs), initial=1e-300))
 
 
 def test_a_model_that_limits_its_contacts_is_native():

@@ -3,27 +3,22 @@
 What does not depend on contact runs on a cart.
 """
 
-import dataclasses
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
-from estimators import AlphaOrder, Evaluation, draw, first_order, zeroth_order
-from estimators.sampling import sample_keys as keys_of_orders
+from estimators import Evaluation, first_order, zeroth_order
 from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
 from mjx_study.runtime import local_devices
-from mjx_study.simulation import constraint, dynamics
-from mjx_study.simulation.contact import ContactModel, contact_model, family_model
+from mjx_study.simulation import dynamics
+from mjx_study.simulation.contact import ContactModel, family_model
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
-from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
+from mjx_study.tasks.policy import LinearFeedback
 from tests.carts import cart
-from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import HORIZON, NO_NOISE, SIGMA, cost, penalty, pusher_simulator, pusher_task, sample_keys
 
 ANY_CONTACT = ContactModel(jnp.array([-1.0, -1.0]), jnp.array([0.9, 0.9, 0.001, 0.5, 2.0]))
@@ -33,12 +28,6 @@ LIMIT = 0.25  # [N]; controls beyond it have no cost in the task that breaks
 @pytest.fixture
 def simulator() -> Simulator:
     return pusher_simulator()
-
-
-@pytest.fixture(scope="module")
-def large() -> Simulator:
-    """Two chunks hold 1000 samples."""
-    return Simulator(pusher_task(), chunk_size=500)
 
 
 # Compilation, chunks, devices
@@ -56,15 +45,6 @@ def test_a_sweep_compiles_each_program_once(simulator):
             compiled.append(simulator.num_compilations)
             assert np.all(np.isfinite(values)) and np.all(np.isfinite(gradients))
     assert set(compiled) == {2}
-
-
-@pytest.mark.slow
-def test_chunk_size_does_not_matter_in_contact(simulator, large):
-    """Other samples share a solver loop; at K = 10 rounding is not amplified."""
-    contact, theta = penalty(10.0), pusher_task().theta
-    small, big = (one.objective(contact).differentiate(theta, sample_keys(130)) for one in (simulator, large))
-    np.testing.assert_allclose(small.value, big.value, rtol=1e-12)
-    np.testing.assert_allclose(small.gradient, big.gradient, rtol=1e-12, atol=1e-12 * np.abs(big.gradient).max())
 
 
 @pytest.fixture(scope="module")
@@ -163,18 +143,6 @@ def test_evaluating_never_differentiates_the_dynamics(monkeypatch):
     np.testing.assert_array_equal(alone.score, both.score)
 
 
-def test_batches_of_an_interpolated_estimate_are_independent(simulator):
-    """Noise of the zeroth-order batch against that of the first-order batch: 50 x 200 pairs, correlation 0 +- 1e-2."""
-    objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
-    zeroth, first = draw(AlphaOrder.needs, objective, theta, jax.random.key(0), 50).values()
-    replayed = objective.evaluate(theta, keys_of_orders(jax.random.key(0), 50)[1])
-    np.testing.assert_array_equal(replayed.value, first.value)  # so its scores hold the first-order batch's noise
-    correlation = np.corrcoef(np.ravel(zeroth.score), np.ravel(replayed.score))[0, 1]
-    assert abs(correlation) < 4 / np.sqrt(50 * HORIZON)
-    # Nor is any sample of one the same as any sample of the other.
-    assert not np.intersect1d(np.ravel(zeroth.score), np.ravel(replayed.score)).size
-
-
 # Scores and baselines
 
 
@@ -188,14 +156,6 @@ def test_score_is_the_noise_over_its_variance(simulator):
     wider = simulator.objective(penalty(10.0), 3 * SIGMA).evaluate(theta, sample_keys(3))
     np.testing.assert_allclose(wider.score, evaluation.score / 3, rtol=1e-13)
     assert np.all(wider.value != evaluation.value)
-
-
-def test_score_has_mean_zero_and_the_fisher_information(simulator):
-    """E s = 0 and E s^2 = 1 / sigma^2 per entry: 300 x 200 normal numbers, whose squares have variance 2."""
-    score = simulator.objective(penalty(10.0)).evaluate(pusher_task().theta, sample_keys(300)).score
-    noise = np.asarray(score).ravel()[:, None] * SIGMA
-    assert_mean_is(noise, [0.0])  # resolves 0.05 standard deviations
-    assert_mean_is(noise**2, [1.0])
 
 
 def test_baseline_is_the_cost_without_noise(simulator):
@@ -245,23 +205,6 @@ def closed_loop() -> Simulator:
     return Simulator(task.replace(policy=policy, theta=GAINS, start=start), chunk_size=16)
 
 
-def test_policies_are_policies():
-    launch = InitialStatePolicy(2, 3, 1, lambda start, theta: start)
-    assert all(isinstance(policy, Policy) for policy in (OpenLoop(3, 2), LinearFeedback(3, 1, 5, features), launch))
-
-
-def test_a_linear_policys_score_is_its_vector_jacobian_product():
-    policy = LinearFeedback(4, 2, 5, features)
-    theta, noise = (jax.random.normal(key, shape) for key, shape in zip(sample_keys(2), ((10,), (4, 2)), strict=True))
-    states = State(*(jax.random.normal(key, (4, 2)) for key in sample_keys(4, 1)))
-
-    def controls(theta):
-        return policy.feedforward(theta, 0 * noise) + jax.vmap(lambda state: policy.feedback(theta, state))(states)
-
-    expected = jax.vjp(controls, theta)[1](noise)[0]
-    np.testing.assert_allclose(policy.score(theta, states, noise), expected, rtol=1e-14)
-
-
 def test_each_sample_has_the_baseline_of_its_random_start(closed_loop):
     assert closed_loop.task.random_start and not pusher_task().random_start
     noisy = closed_loop.objective(penalty(100.0)).evaluate(GAINS, sample_keys(5))
@@ -280,16 +223,6 @@ def test_gradient_through_feedback_against_differences(closed_loop):
         # 3 of 16 samples may straddle an onset, where the force jumps by 1e-4 of the approach's acceleration.
         errors = np.abs((ahead - behind) / 2e-4 - gradient[:, index]) / np.linalg.norm(gradient, axis=1)
         assert np.sum(errors < 1e-6) >= 13, errors
-
-
-def test_feedback_gives_both_orders_one_mean(closed_loop):
-    """A score that forgot the states, or a gradient that forgot the feedback, would move one of them."""
-    objective = closed_loop.objective(penalty(10.0), sigma=0.3)
-    zeroth = zeroth_order(objective.evaluate(GAINS, sample_keys(3000, 1)), "zero_noise")
-    first = first_order(objective.differentiate(GAINS, sample_keys(1000, 2)))
-    spread = np.hypot(zeroth.standard_error, first.standard_error)
-    assert np.all(np.abs(zeroth.mean - first.mean) < 4 * spread)
-    assert 4 * np.linalg.norm(spread) < 0.25 * np.linalg.norm(first.mean), "no power"
 
 
 def test_odd_part_refuses_feedback(closed_loop):
@@ -337,60 +270,6 @@ def test_residual_of_the_shipped_budget_is_rounding(simulator):
             objective.differentiate(pusher_task().theta, sample_keys(16)),
         ):
             assert batch.residual is not None and float(batch.residual.max()) < 1e-8
-
-
-BALL = """<mujoco model="ball">
-  <option timestep="0.005" cone="elliptic" iterations="{0}" ls_iterations="{0}"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1"/>
-    <body pos="0 0 0.0995">
-      <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
-      <joint name="spin" type="hinge" axis="0 1 0"/><geom name="ball" size="0.1" mass="1"/>
-    </body>
-  </worldbody>
-  <actuator><motor joint="x"/></actuator>
-</mujoco>"""
-
-
-@pytest.mark.slow
-def test_a_starved_solver_shows_in_the_residual(monkeypatch):
-    """A ball that slides and spins: the elliptic cone couples the rows, and one iteration does not solve it.
-
-    The pusher cannot show this: its one frictionless contact is a quadratic, which one Newton step solves. MJX's solver
-    has a budget, the one for small systems has not.
-    """
-    monkeypatch.setattr(constraint, "OWN_SOLVER", False)
-    residuals = {}
-    for iterations in (1, 50):
-        scene = put_scene(mujoco.MjModel.from_xml_string(BALL.format(iterations)), "ball")
-        task = dataclasses.replace(
-            cart(horizon=2),
-            scene=scene,
-            theta=jnp.full(2, 8.0),
-            start=initial_state(scene, qvel=jnp.array([0.5, -0.1, 0.3])),
-            running_cost=lambda state, control: jnp.sum(state.qvel**2),
-        )
-        contact = contact_model((0.02, 1.0), scene=scene)
-        residual = Simulator(task, chunk_size=2).objective(contact).evaluate(task.theta, sample_keys(3)).residual
-        assert residual is not None
-        residuals[iterations] = float(np.max(residual))
-    assert residuals[1] > 1e-3
-    assert residuals[50] < 1e-8
-
-
-# Memory
-
-
-@pytest.mark.slow
-def test_memory_of_a_thousand_gradients(large):
-    """1000 samples of 200 steps at once: 24 numbers per step, among them the 2 x 5 Jacobian, make 36.6 MiB."""
-    task = pusher_task()
-    keys = np.asarray(jax.random.key_data(sample_keys(1000)))
-    arguments = (task.theta, penalty(10.0), np.asarray(SIGMA), keys[:500], np.ones(500))
-    plan = large._programs["gradient"].jitted.lower(*arguments).compile().memory_analysis()
-    temporary, output = 2 * plan.temp_size_in_bytes, 2 * plan.output_size_in_bytes  # the plan is of a chunk
-    assert 1000 * HORIZON * 8 <= output <= 1000 * (HORIZON + 10) * 8  # gradients, values, residuals
-    assert output <= temporary <= 40 * 2**20
 
 
 # Refusals

@@ -116,15 +116,3 @@ def test_the_mean_has_the_slope_over_the_model(onset: str) -> None:
     for name, (slope, _) in expected.items():
         assert abs(corrected[name][0] - slope) < 0.03 * abs(slope), name
         assert abs(plain[name][0] - slope) > 4 * abs(slope) or name == "damping ratio"
-
-
-@pytest.mark.parametrize("compose", [jax.hessian, lambda function: jax.jacfwd(jax.jacfwd(function))])
-def test_a_second_derivative_over_the_model_is_refused(compose: Any) -> None:
-    scene = scene_of(FALLING)
-    start = initial_state(scene, jnp.array([0.01]), jnp.array([-1.5]))
-
-    def height(solref: Any) -> Any:
-        return last_state("linear", "linear", scene, scene.model.replace(geom_solref=solref), start, 20)[0][0]
-
-    with pytest.raises(TypeError, match="derivatives with the onset term are of first order"):
-        jax.eval_shape(compose(height), scene.model.geom_solref)

@@ -148,8 +148,8 @@ def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:
     )
     np.testing.assert_allclose(after.theta, [[0.9, 1.9], [1, 2], [1, 2], [1, 2]])
     assert after.reason.tolist() == [0, 1, 3, 4]
-    np.testing.assert_array_equal(np.isnan(record.cost), [False, False, True, False])
-    assert record.nonfinite[1] == 5
+    np.testing.assert_array_equal(np.isnan(record["cost"]), [False, False, True, False])
+    assert record["nonfinite"][1] == 5
 
 
 def test_a_diverging_run_keeps_its_history_and_says_why() -> None:

@@ -217,6 +217,9 @@ def test_no_such_module(write) -> None:
     told = "module:name of your own, or an MJCF (there is no module 'mine' here or installed)"
     assert refused("mine:hop").endswith(told)
     assert refused("ball_wall:dom").startswith("unknown task 'ball_wall:dom'; did you mean ball_wall:dome? (")
+    write(TINY)
+    assert refused("mine") == "mine is a module: choose a task in it, as mine:hop"
+    assert refused("mine.py") == "mine.py is a module: choose a task in it, as mine:hop"
     for name in ("mine.py:hop", "folder/mine:hop", ":hop", ".mine:hop"):
         assert refused(name).endswith("is not a module name: write it as in an import, without a folder or .py)")
 

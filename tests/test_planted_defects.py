@@ -7,8 +7,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from tests.planted import DEFECTS
-from tests.planted.defect import Defect, plant
+from tests.planted.defects import DEFECTS, Defect, plant
 from tests.planted.models import MODELS
 
 ROOT = Path(__file__).parents[1]

@@ -119,14 +119,6 @@ def test_what_a_sample_gives_depends_on_no_other():
             np.testing.assert_array_equal(some, every[part])
 
 
-def test_differentiated_after_all():
-    """A program of native loops has derivatives, those of the scan."""
-    ours, theirs = (
-        jax.jit(jax.grad(lambda x, of=of: of(FIXED, x, ROWS[0])[0])) for of in (with_native_scans(gradient), gradient)
-    )
-    np.testing.assert_allclose(ours(STARTS[0]), theirs(STARTS[0]), rtol=1e-12)
-
-
 def whole_array(fixed, start, rows):
     return lax.scan(lambda x, row: (jnp.fft.fft(x + row).real, None), start, rows)
 

@@ -14,10 +14,7 @@ import numpy as np
 import pytest
 
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
-from mjx_study.cli.options import given_options
 from mjx_study.graph.native import native_identity
-from mjx_study.options.configuration import as_arguments
-from mjx_study.options.parser import TASK_OPTIONS, Parser
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.limitations import FLAGS
 from mjx_study.simulation.scene import (
@@ -33,7 +30,7 @@ from mjx_study.simulation.scene import (
 from mjx_study.tasks import make_task
 from tests.scenes import FREE_BOX, floor_scene, slider
 
-FREE = '<body pos="0 0 1"><freejoint/><geom type="{}" size=".1 .1 .1" condim="{}"/></body>'
+FREE = '<body pos="0 0 1"><freejoint/><geom size=".1" condim="{}"/></body>'
 
 
 @pytest.fixture(scope="module")
@@ -52,13 +49,6 @@ def test_a_name_needs_no_particular_working_directory(tmp_path: Path) -> None:
     code = "from mjx_study.simulation.scene import load_scene; print(load_scene('pusher').host.nq)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, "2\n"), done.stderr
-
-
-def test_a_path_is_loaded_and_left_as_it_is(tmp_path: Path) -> None:
-    path = tmp_path / "copy.xml"
-    path.write_text((models_folder() / "pusher.xml").read_text())
-    assert load_scene(path).name == "copy"
-    assert load_scene(str(path)).host.nv == 2
 
 
 ENUMERATED = {
@@ -100,11 +90,8 @@ def test_numeric_options_reach_mjx() -> None:
         ({"disable_flags": "energie"}, r"unknown flag 'energie'; did you mean energy\?"),
         ({"disable_flags": 1}, "disable_flags must be names of flags, got 1"),
         ({"timestep": 0.0}, "timestep must be a positive number, got 0.0"),
-        ({"timestep": -0.1}, "timestep must be a positive number, got -0.1"),
         ({"timestep": float("nan")}, "timestep must be a positive number, got nan"),
-        ({"timestep": float("inf")}, "timestep must be a positive number, got inf"),
         ({"timestep": "fast"}, "timestep must be a positive number, got 'fast'"),
-        ({"iterations": 0}, "iterations must be a positive whole number, got 0"),
         ({"iterations": 0.5}, "iterations must be a positive whole number, got 0.5"),
         ({"ls_iterations": 2.5}, "ls_iterations must be a positive whole number, got 2.5"),
         ({"adjoint": "unrolled"}, "unknown adjoint 'unrolled'; choose from auto, graph, tape"),
@@ -126,32 +113,20 @@ def test_the_adjoint_is_chosen_by_size_or_by_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "message", "remedy"),
+    ("option", "remedy", "message"),
     [
-        (
-            '<option solver="PGS"/>',
-            r"MJX lacks the solver that here asks for; set one of newton, cg in its <option>, or give --solver$",
-            {"solver": "newton"},
-        ),
-        (
-            '<option integrator="implicit"/>',
-            r"the integrator that here asks for; set one of euler, implicitfast, rk4 in .* --integrator$",
-            {"integrator": "euler"},
-        ),
-        (
-            '<option integrator="RK4"/>',
-            r"here combines RK4 with contacts.*; set integrator to euler or implicitfast in .* --integrator euler$",
-            {"integrator": "implicitfast"},
-        ),
-        (
-            '<option><flag fwdinv="enable" sleep="enable"/></option>',
-            r"MJX lacks fwdinv, sleep, which here enables; disable them in .* --disable-flag fwdinv,sleep$",
-            {"disable_flags": "fwdinv,sleep"},
-        ),
+        ('<option solver="PGS"/>', {"solver": "newton"},
+         r"MJX lacks the solver that here asks for; set one of newton, cg in its <option>, or give --solver$"),
+        ('<option integrator="implicit"/>', {"integrator": "euler"},
+         r"the integrator that here asks for; set one of euler, implicitfast, rk4 in .* --integrator$"),
+        ('<option integrator="RK4"/>', {"integrator": "implicitfast"},
+         r"here combines RK4 with contacts.*; set integrator to euler or implicitfast in .* --integrator euler$"),
+        ('<option><flag fwdinv="enable" sleep="enable"/></option>', {"disable_flags": "fwdinv,sleep"},
+         r"MJX lacks fwdinv, sleep, which here enables; disable them in .* --disable-flag fwdinv,sleep$"),
     ],
-)
+)  # fmt: skip
 def test_options_that_mjx_lacks_are_refused_and_what_is_told_helps(
-    option: str, message: str, remedy: dict[str, Any]
+    option: str, remedy: dict[str, Any], message: str
 ) -> None:
     host = mujoco.MjModel.from_xml_string(floor_scene(FREE_BOX, option))
     before = int(host.opt.integrator), int(host.opt.solver), host.opt.enableflags
@@ -164,21 +139,6 @@ def test_options_that_mjx_lacks_are_refused_and_what_is_told_helps(
 def test_energy_that_mjx_would_not_compute_is_left_out() -> None:
     host = mujoco.MjModel.from_xml_string(floor_scene(FREE_BOX, '<option><flag energy="enable"/></option>'))
     assert put_scene(host, "here").host.opt.enableflags == 0 < host.opt.enableflags
-
-
-def test_the_command_line_changes_what_is_refused(tmp_path: Path) -> None:
-    """The model of a file with everything that a message tells one to give, as `gradcheck` reads it."""
-    path = tmp_path / "walker.xml"
-    option = '<option integrator="RK4" solver="PGS"><flag fwdinv="enable" sleep="enable"/></option>'
-    path.write_text(floor_scene(FREE_BOX, option))
-    parser = Parser()
-    parser.add_builder_options()
-    given = "--solver newton --disable-flag fwdinv,sleep --integrator euler".split()
-    for count, message in ((0, "--solver"), (2, "--disable-flag fwdinv,sleep"), (4, "--integrator")):
-        with pytest.raises(SceneError, match=message):
-            load_scene(path, **as_arguments(given_options(parser.parse_args(given[:count]), *TASK_OPTIONS)))
-    chosen = as_arguments(given_options(parser.parse_args(given), *TASK_OPTIONS))
-    assert load_scene(path, **chosen).host.opt.enableflags == 0
 
 
 @pytest.mark.parametrize("flag", FLAGS)
@@ -220,8 +180,6 @@ def joint(**parts: str) -> mujoco.MjModel:
         ({"option": 'actuatorgroupdisable="2"', "actuator": '<motor joint="j" group="2"/>'}, "actuatorgroupdisable"),
         ({"option": 'integrator="implicitfast"', "actuator": MUSCLE}, r"muscles' damping .*--integrator euler"),
         ({"joint": 'stiffness="1 2"'}, "polynomial stiffness or damping"),
-        ({"joint": 'damping="0 2"'}, "polynomial stiffness or damping"),
-        ({"tendon": TENDON.format('stiffness="1 2"')}, "polynomial stiffness or damping"),
         ({"tendon": TENDON.format('damping="0 2"')}, "polynomial stiffness or damping"),
         ({"geom": 'adhesion="3"'}, "adhesion of geoms"),
         ({"geom": 'surfacevel="1 0 0 0 0 0"'}, "surfacevel"),
@@ -254,28 +212,20 @@ def test_what_has_no_effect_is_not_refused(parts: dict[str, str]) -> None:
     put_scene(joint(**parts), "here")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (
-            floor_scene(
-                '<body name="b" pos="0 0 1">'
-                '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2"/></body>'
-            ),
-            "MJX cannot run here: Flex not implemented",
-        ),
-        (
-            floor_scene(FREE.format("sphere", 1) + FREE.format("sphere", 3), '<option cone="elliptic"/>', 'condim="1"'),
-            "MJX cannot run here: condim=1 with ConeType.ELLIPTIC not implemented",
-        ),
-    ],
+CLOTH = (
+    '<body name="b" pos="0 0 1"><flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" dim="2"/></body>'
 )
-def test_models_that_mjx_lacks_are_refused(
-    text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+
+
+def test_models_that_mjx_lacks_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo logs a warning about the cloth to a file where it stands
-    with pytest.raises(SceneError, match=message):
-        put_scene(mujoco.MjModel.from_xml_string(text), "here")
+    elliptic = floor_scene(FREE.format(1) + FREE.format(3), '<option cone="elliptic"/>', 'condim="1"')
+    for text, message in (
+        (floor_scene(CLOTH), "MJX cannot run here: Flex not implemented"),
+        (elliptic, "MJX cannot run here: condim=1 with ConeType.ELLIPTIC not implemented"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            put_scene(mujoco.MjModel.from_xml_string(text), "here")
 
 
 def test_names_are_looked_up_and_choices_listed(pusher) -> None:
@@ -321,26 +271,17 @@ def test_a_model_in_a_task_s_place_may_number_its_bodies_otherwise(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("task", "changes", "says"),
+    ("task", "new", "says"),
     [
-        (
-            "momentum_transfer",
-            (('"x" type', '"y" type'), ('"y" type', '"x" type')),
-            "the joints of mine must come in the order x, y, pivot; they come as y, x, pivot",
-        ),
-        (
-            "tennis",
-            (('name="paddle_x" joint="paddle_x"', 'name="first" joint="paddle_angle"'),),
-            "must drive paddle_x, paddle_y, paddle_angle in this order; they drive paddle_angle, paddle_y",
-        ),
-        ("sliding_box", (('joint="block"', 'joint="box"'),), "must drive block in this order; they drive box"),
+        ("momentum_transfer", {'"x" type': '"y" type', '"y" type': '"x" type'},
+         "the joints of mine must come in the order x, y, pivot; they come as y, x, pivot"),
+        ("tennis", {'name="paddle_x" joint="paddle_x"': 'name="first" joint="paddle_angle"'},
+         "must drive paddle_x, paddle_y, paddle_angle in this order; they drive paddle_angle, paddle_y"),
+        ("sliding_box", {'joint="block"': 'joint="box"'}, "must drive block in this order; they drive box"),
     ],
-    ids=["joints", "actuators of a paddle", "a motor"],
-)
-def test_a_model_in_a_task_s_place_has_its_order(
-    tmp_path: Path, task: str, changes: tuple[tuple[str, str], ...], says: str
-) -> None:
-    path, new = tmp_path / "mine.xml", dict(changes)
+)  # fmt: skip
+def test_a_model_in_a_task_s_place_has_its_order(tmp_path: Path, task: str, new: dict[str, str], says: str) -> None:
+    path = tmp_path / "mine.xml"
     path.write_text(re.sub("|".join(map(re.escape, new)), lambda found: new[found[0]], shipped(task)))
     with pytest.raises(SceneError, match=says):
         make_task(task, model=path)

@@ -1,7 +1,7 @@
 """Objectives whose expectations have closed forms."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,8 @@ from jax import Array
 from jax.scipy.stats import norm
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
+from experiments.linear_quadratic import LinearQuadratic
+from mjx_study.reference import ReferenceObjective
 
 
 @dataclass(frozen=True)
@@ -100,109 +102,44 @@ def linear(slope: np.ndarray, sigma: float) -> OneStep:
     return OneStep(lambda x: jnp.sum(jnp.asarray(slope, x.dtype) * x), len(slope), sigma)
 
 
+HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
+
+
 def quadratic(hessian: np.ndarray, sigma: float) -> OneStep:
     """x^T hessian x / 2."""
     return OneStep(lambda x: 0.5 * x @ jnp.asarray(hessian, x.dtype) @ x, len(hessian), sigma)
 
 
-@dataclass(frozen=True)
-class LinearQuadratic:
-    """x' = A x + B u, u = K x + w with theta = vec K, quadratic costs, random start: a feedback policy."""
+SYSTEM = LinearQuadratic(
+    transition=np.array([[0.9, 0.3], [-0.2, 0.8]]),
+    control=np.array([[0.5, 0.1], [-0.3, 0.7]]),
+    state_weight=np.array([[1.0, 0.2], [0.2, 0.5]]),
+    control_weight=np.array([[0.3, 0.0], [0.0, 0.2]]),
+    final_weight=np.array([[1.0, 0.2], [0.2, 0.5]]),
+)
+START, START_DEVIATION = np.array([1.0, -0.5]), 0.3
 
-    sigma: float = 0.4
-    start_deviation: float = 0.3
-    horizon: int = 3
-    num_params: int = 4
-    transition: np.ndarray = field(default_factory=lambda: np.array([[0.9, 0.3], [-0.2, 0.8]]))
-    control: np.ndarray = field(default_factory=lambda: np.array([[0.5, 0.1], [-0.3, 0.7]]))
-    start: np.ndarray = field(default_factory=lambda: np.array([1.0, -0.5]))
-    state_cost: np.ndarray = field(default_factory=lambda: np.array([[1.0, 0.2], [0.2, 0.5]]))
-    control_cost: np.ndarray = field(default_factory=lambda: np.array([[0.3, 0.0], [0.0, 0.2]]))
 
-    def expected_cost(self, theta: Array) -> Array:
-        """F by the recursion of the second moment S of the state."""
-        gain = theta.reshape(2, 2)
-        start = jnp.asarray(self.start)
-        moment = jnp.outer(start, start) + self.start_deviation**2 * jnp.eye(2)
-        closed_loop, cost = self.transition + self.control @ gain, jnp.zeros(())
-        for _ in range(self.horizon):
-            control_moment = gain @ moment @ gain.T + self.sigma**2 * jnp.eye(2)
-            cost += jnp.trace(self.state_cost @ moment) + jnp.trace(self.control_cost @ control_moment)
-            moment = closed_loop @ moment @ closed_loop.T + self.sigma**2 * self.control @ self.control.T
-        return cost + jnp.trace(self.state_cost @ moment)
+def draw_start(key: Array) -> Array:
+    return jnp.asarray(START) + START_DEVIATION * jax.random.normal(key, (2,))
 
-    def sample(self, key: Array) -> tuple[Array, Array]:
-        start_key, noise_key = jax.random.split(key)
-        start = jnp.asarray(self.start) + self.start_deviation * jax.random.normal(start_key, (2,))
-        return start, self.sigma * jax.random.normal(noise_key, (self.horizon, 2))
 
-    def rollout(self, theta: Array, start: Array, noise: Array) -> tuple[Array, Array]:
-        """Costs to go, and the states before each step."""
-        gain, state, costs, states = theta.reshape(2, 2), start, [], []
-        for step in range(self.horizon):
-            control = gain @ state + noise[step]
-            states.append(state)
-            costs.append(state @ self.state_cost @ state + control @ self.control_cost @ control)
-            state = jnp.asarray(self.transition) @ state + jnp.asarray(self.control) @ control
-        costs[-1] += state @ self.state_cost @ state
-        return jnp.cumsum(jnp.stack(costs)[::-1])[::-1], jnp.stack(states)
+FEEDBACK = ReferenceObjective(SYSTEM, draw_start, horizon=3, sigma=0.4, parametrises="feedback")
+"""u = K x + w with theta = vec K, of a linear system with quadratic costs and a random start."""
 
-    def steps(self, theta: Array, starts: Array, noise: Array) -> StepEvaluation:
-        value, states = jax.vmap(lambda start, w: self.rollout(theta, start, w))(starts, noise)
-        silent, _ = jax.vmap(lambda start, w: self.rollout(theta, start, 0 * w))(starts, noise)
-        jacobian = jnp.einsum("uv,isx->isuvx", jnp.eye(2), states).reshape(*noise.shape, 4)
-        return StepEvaluation(value, silent, noise / self.sigma**2, jacobian)
 
-    def at_noise(self, theta: Array, starts: Array, noise: Array) -> Evaluation:
-        steps = self.steps(theta, starts, noise)
-        assert steps.policy_jacobian is not None
-        score = jnp.einsum("ishp,ish->ip", steps.policy_jacobian, steps.noise_score)
-        return Evaluation(steps.value_to_go[:, 0], score, steps.baseline_to_go[:, 0])
+def of_feedback(theta: np.ndarray) -> tuple[float, np.ndarray]:
+    """Mean cost of `FEEDBACK` and its gradient, by the recursion of the second moment S of the state."""
 
-    def evaluate(self, theta: Array, keys: Array) -> Evaluation:
-        return self.at_noise(theta, *jax.vmap(self.sample)(keys))
+    def mean_cost(gain: Array) -> Array:
+        noise = FEEDBACK.sigma**2
+        moment = jnp.asarray(np.outer(START, START)) + START_DEVIATION**2 * jnp.eye(2)
+        closed_loop, cost = SYSTEM.transition + SYSTEM.control @ gain, jnp.zeros(())
+        for _ in range(FEEDBACK.horizon):
+            of_control = gain @ moment @ gain.T + noise * jnp.eye(2)
+            cost += jnp.trace(SYSTEM.state_weight @ moment) + jnp.trace(SYSTEM.control_weight @ of_control)
+            moment = closed_loop @ moment @ closed_loop.T + noise * SYSTEM.control @ SYSTEM.control.T
+        return cost + jnp.trace(SYSTEM.final_weight @ moment)
 
-    def evaluate_pair(self, theta: Array, keys: Array) -> tuple[Evaluation, Evaluation]:
-        starts, noise = jax.vmap(self.sample)(keys)
-        return self.at_noise(theta, starts, noise), self.at_noise(theta, starts, -noise)
-
-    def evaluate_steps(self, theta: Array, keys: Array) -> StepEvaluation:
-        return self.steps(theta, *jax.vmap(self.sample)(keys))
-
-    def evaluate_step_pair(self, theta: Array, keys: Array) -> tuple[StepEvaluation, StepEvaluation]:
-        starts, noise = jax.vmap(self.sample)(keys)
-        return self.steps(theta, starts, noise), self.steps(theta, starts, -noise)
-
-    def differentiate(self, theta: Array, keys: Array) -> Differentiation:
-        def one(start: Array, noise: Array) -> tuple[Array, Array]:
-            return jax.value_and_grad(lambda at: self.rollout(at, start, noise)[0][0])(theta)
-
-        value, gradient = jax.vmap(one)(*jax.vmap(self.sample)(keys))
-        return Differentiation(value, gradient)
-
-    def differentiate_corrected(self, theta: Array, keys: Array) -> Differentiation:
-        return self.differentiate(theta, keys)
-
-    def differentiate_steps(self, theta: Array, keys: Array) -> StepDifferentiation:
-        starts, noise = jax.vmap(self.sample)(keys)
-        total = jax.value_and_grad(lambda w, start: self.rollout(theta, start, w)[0][0])
-        value, gradient = jax.vmap(total)(noise, starts)
-        return StepDifferentiation(value, gradient, self.steps(theta, starts, noise).policy_jacobian)
-
-    def linearise(self, theta: Array, keys: Array) -> Linearisation:
-        starts, noise = jax.vmap(self.sample)(keys)
-        gain = theta.reshape(2, 2)
-        _, states = jax.vmap(lambda start, w: self.rollout(theta, start, w))(starts, noise)
-        controls = states @ gain.T + noise
-        last = states[:, -1] @ self.transition.T + controls[:, -1] @ self.control.T
-        shape = (*noise.shape[:2], 2, 2)
-        return Linearisation(
-            steps=self.steps(theta, starts, noise),
-            cost_state=2 * states @ self.state_cost,
-            cost_control=2 * controls @ self.control_cost,
-            final_state=2 * last @ self.state_cost,
-            over_state=jnp.broadcast_to(self.transition, shape),
-            over_control=jnp.broadcast_to(self.control, shape),
-            policy_state=jnp.broadcast_to(gain, shape),
-            start_jacobian=None,
-        )
+    value, gradient = jax.value_and_grad(mean_cost)(jnp.reshape(jnp.asarray(theta), (2, 2)))
+    return float(value), np.asarray(gradient).ravel()

@@ -101,29 +101,25 @@ def test_an_unbiased_estimate_with_rare_samples_is_not_called_biased(
         assert speaks > 0.95
 
 
-def test_a_bias_is_found() -> None:
-    """A first-order mean that misses a jump, at 400 samples; and the estimate of its square."""
-    jump = objectives.heaviside(0.6).function
-    objective, theta = objectives.OneStep(lambda x: jump(x) + 0.5 * x[0] ** 2, 1, 0.6), jnp.array([0.3])
+@pytest.mark.parametrize("curvature", [1.0, 0.0])
+def test_a_bias_is_found_where_samples_vary(curvature: float) -> None:
+    """A first-order mean that misses a jump, at 400 samples, and the estimate of its square.
+
+    Samples that are all zero get no verdict: whether a jump is missed, or rare samples are, they cannot tell.
+    """
+    jump, theta = objectives.heaviside(0.6).function, jnp.array([0.3])
+    objective = objectives.OneStep(lambda x: jump(x) + curvature / 2 * x[0] ** 2, 1, 0.6)
     keys = jax.random.split(jax.random.key(1), (2, 400))
     first = first_order(objective.differentiate(theta, keys[0]))
     zeroth = zeroth_order(objective.evaluate(theta, keys[1]), "zero_noise")
     test = bias_test(first, zeroth, jax.random.key(2), num_draws=999)
-    assert test.p_value == pytest.approx(0.001)
-    exact = float(objectives.heaviside_gradient(theta, 0.6)[0])
-    assert test.squared_bias == pytest.approx(exact**2, rel=0.4)
-    assert test.effective_samples > 20
     np.testing.assert_allclose(test.distance, np.linalg.norm(first.mean - zeroth.mean), rtol=1e-14)
-
-
-def test_equal_samples_get_no_verdict() -> None:
-    """The Heaviside function: whether a jump is missed, or rare samples are, samples that are all zero cannot tell."""
-    objective, theta = objectives.heaviside(0.6), jnp.array([0.3])
-    keys = jax.random.split(jax.random.key(1), (2, 400))
-    first = first_order(objective.differentiate(theta, keys[0]))
-    zeroth = zeroth_order(objective.evaluate(theta, keys[1]), "zero_noise")
-    test = bias_test(first, zeroth, jax.random.key(2), num_draws=99)
-    assert np.isnan(test.p_value) and test.effective_samples == 0 and test.distance > 0.5
+    if curvature:
+        exact = float(objectives.heaviside_gradient(theta, 0.6)[0])
+        assert test.p_value == pytest.approx(0.001) and test.effective_samples > 20
+        assert test.squared_bias == pytest.approx(exact**2, rel=0.4)
+    else:
+        assert np.isnan(test.p_value) and test.effective_samples == 0 and test.distance > 0.5
 
 
 def test_lost_samples_and_empty_batches() -> None:
@@ -238,12 +234,6 @@ def test_plug_in_bounds_fail_on_rare_events(proxy: str) -> None:
 def test_plug_in_bounds_hold_where_tails_are_seen(name: str, proxy: str) -> None:
     _, lower, _ = coverage(name, proxy, "max_deviation", 100)
     assert lower > 0.9
-
-
-def test_the_published_reading_of_delta_is_as_cautious_on_gaussians() -> None:
-    """delta = 0.95 in the logarithm states an interval that may fail 95 % of the time; on Gaussians it rarely does."""
-    share, lower, upper = coverage("gaussian", "variance", "max_deviation", 100, probability=0.95)
-    assert 0.9 < lower <= share <= upper
 
 
 @pytest.mark.parametrize(("samples", "share"), [(50, 0.81), (400, 0.78)])

@@ -12,19 +12,17 @@ from estimators import ESTIMATORS, Estimator, InverseVariance, make_estimator
 from tests.estimators import objectives
 from tests.estimators.statistics_helpers import assert_mean_is
 
-FEEDBACK = objectives.LinearQuadratic()
-HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
 CASES = {
-    "feedback": (FEEDBACK, np.array([0.4, 0.1, 0.2, 0.5])),
-    "open loop": (objectives.quadratic(HESSIAN, 0.7), np.array([0.5, -0.6, 0.3])),
+    "feedback": (objectives.FEEDBACK, np.array([0.4, 0.1, 0.2, 0.5])),
+    "open loop": (objectives.quadratic(objectives.HESSIAN, 0.7), np.array([0.5, -0.6, 0.3])),
 }
 WEIGHED = ("aobg", "ivw", "ivw_h", "total_propagation", "ddcg")
 SAMPLES, TRIALS = 10, 30_000
 
 
 def exact(case: str) -> np.ndarray:
-    theta = jnp.asarray(CASES[case][1])
-    return np.asarray(jax.grad(FEEDBACK.expected_cost)(theta) if case == "feedback" else jnp.asarray(HESSIAN) @ theta)
+    theta = CASES[case][1]
+    return objectives.of_feedback(theta)[1] if case == "feedback" else objectives.HESSIAN @ theta
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +31,7 @@ def batches() -> dict[str, dict[str, object]]:
     found = {}
     needed = estimators.oracles_of(ESTIMATORS[name] for name in WEIGHED)
     for case, (objective, theta) in CASES.items():
-        draw = jax.jit(
-            lambda key, objective=objective, theta=theta: estimators.draw(
-                needed, objective, jnp.asarray(theta), key, SAMPLES * TRIALS
-            )
-        )
-        drawn = draw(jax.random.key(20))
+        drawn = estimators.draw(needed, objective, jnp.asarray(theta), jax.random.key(20), SAMPLES * TRIALS)
         found[case] = jax.tree.map(lambda leaf: leaf.reshape(TRIALS, SAMPLES, *leaf.shape[1:]), drawn)
     return found
 

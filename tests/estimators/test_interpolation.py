@@ -56,20 +56,10 @@ def test_weight_is_the_constrained_minimum():
 @pytest.mark.parametrize(
     ("zeroth", "first", "exact"),
     [
-        (3.0, 1.0, 0.75),
-        (0.0, 1.0, 0.0),
-        (1.0, 0.0, 1.0),
-        (0.0, 0.0, 0.0),
-        (INF, 1.0, 1.0),
-        (1.0, INF, 0.0),
-        (INF, INF, 0.0),
-        (1.5e308, 1.5e308, 0.5),
-        (NAN, 1.0, 0.0),
-        (1.0, NAN, 0.0),
-        (0.0, NAN, 0.0),
-        (NAN, 0.0, 0.0),
+        (3.0, 1.0, 0.75), (0.0, 1.0, 0.0), (1.0, 0.0, 1.0), (0.0, 0.0, 0.0), (INF, 1.0, 1.0), (1.0, INF, 0.0),
+        (INF, INF, 0.0), (1.5e308, 1.5e308, 0.5), (NAN, 1.0, 0.0), (1.0, NAN, 0.0), (0.0, NAN, 0.0), (NAN, 0.0, 0.0),
     ],
-)
+)  # fmt: skip
 def test_inverse_variance_weight(zeroth: float, first: float, exact: float):
     assert inverse_variance_alpha(jnp.array(zeroth), jnp.array(first)) == exact
 

@@ -1,7 +1,9 @@
-"""Running estimators by name: oracles, keys, sharing, precision, transformations and refusals."""
+"""Running estimators by name: oracles, keys, sharing, precision, transformations, refusals; and their page."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import jax
@@ -12,7 +14,9 @@ from jax import Array
 
 import estimators
 from estimators import (
+    BASELINES,
     ESTIMATORS,
+    NOISES,
     ORACLES,
     AlphaOrder,
     Differentiation,
@@ -25,7 +29,11 @@ from estimators import (
     make_estimator,
     zeroth_order,
 )
+from estimators.registry import markdown_table
 from tests.estimators import objectives
+from tests.estimators.statistics_helpers import assert_mean_is
+
+PAGE = (Path(__file__).parents[2] / "docs" / "estimators.md").read_text()
 
 # Compiled whole: a fraction of the time of compiling operation by operation.
 leave_one_out = jax.jit(estimators.leave_one_out)
@@ -80,15 +88,6 @@ def test_estimators_and_oracles_describe_themselves():
         assert isinstance(made(name), entry) and made(name) == made(name) and hash(made(name)) == hash(made(name))
     for name, oracle in ORACLES.items():
         assert oracle.name == name and oracle.order in (0, 1)
-
-
-def test_sample_i_depends_on_key_i_alone():
-    # Batches of one size: XLA may round the last lanes of a batch of another size differently, by one ulp.
-    keys = jax.random.split(jax.random.key(1), 10)
-    others = jax.random.split(jax.random.key(2), 10).at[3:5].set(jax.random.clone(keys)[3:5])
-    one, other = (OBJECTIVE.evaluate(jnp.asarray(THETA), batch).value for batch in (keys, others))
-    np.testing.assert_array_equal(one[3:5], other[3:5])
-    assert not np.isin(np.delete(other, [3, 4]), one).any()
 
 
 def drawn(estimator: Estimator) -> GradientEstimate:
@@ -147,21 +146,6 @@ def test_estimates_can_be_mapped_over_parameters():
     shapes = jax.eval_shape(run, thetas[0], jax.random.key(0))
     assert shapes.mean.shape == (2,)
     assert jax.tree.map(lambda leaf: None, mapped).alpha.alpha is None
-
-
-def test_estimators_are_static_arguments():
-    aobg = AlphaOrder(gamma=50.0)
-
-    @jax.jit
-    def through_closure(theta: Array) -> Array:
-        return estimate(aobg, OBJECTIVE, theta, jax.random.key(5), 10).mean
-
-    def through_argument(theta: Array, estimator: Estimator) -> Array:
-        return estimate(estimator, OBJECTIVE, theta, jax.random.key(5), 10).mean
-
-    theta = jnp.asarray(THETA)
-    static = jax.jit(through_argument, static_argnums=1)(theta, aobg)
-    np.testing.assert_array_equal(through_closure(theta), static)
 
 
 @jax.jit
@@ -256,3 +240,19 @@ def test_missing_batches_and_impossible_sizes_are_refused():
 def test_options_out_of_range_are_refused(name: str, change: dict[str, Any], message: str):
     with pytest.raises(ValueError, match=message):
         made(name, **change)
+
+
+def test_the_table_is_that_of_the_classes() -> None:
+    assert markdown_table() in PAGE, f"put this table there:\n{markdown_table()}"
+    assert all(f"`{name}`" in PAGE for name in (*BASELINES, *NOISES))
+
+
+def test_the_example_is_an_estimator() -> None:
+    """In under thirty lines; run like any other, and right where both of its parents are."""
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    assert len(code.splitlines()) < 30
+    module: dict[str, Any] = {"__name__": "my_estimators"}
+    exec(code, module)
+    objective = objectives.linear(np.array([1.0, -2.0]), 0.5)
+    found = estimate(module["SignAgreement"](), objective, jnp.zeros(2), jax.random.key(0), 2000)
+    assert_mean_is(found.per_sample + 1e-3 * jax.random.normal(jax.random.key(1), (2000, 2)), [1.0, -2.0])

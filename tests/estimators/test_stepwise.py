@@ -1,6 +1,5 @@
 """Estimates from single steps and from the backward recursion: identities, means, variances, and where they fail."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import jax
@@ -27,14 +26,14 @@ from estimators import (
     total_propagation,
     truncated_first_order,
 )
+from estimators.noise import split_sample_key
 from estimators.stepwise import control_scores
 from tests.estimators import objectives
 from tests.estimators.statistics_helpers import assert_mean_is
 
 SAMPLES = 100_000
-FEEDBACK = objectives.LinearQuadratic()
+FEEDBACK, SYSTEM = objectives.FEEDBACK, objectives.SYSTEM
 THETA = np.array([0.4, 0.1, 0.2, 0.5])
-HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
 NEUTRAL = ("fobg_clipped", "fobg_truncated")
 """Biased in general, but not with a clip beyond every sample and a window beyond the horizon."""
 UNBIASED = [name for name, estimator in ESTIMATORS.items() if estimator.unbiased != "no"]
@@ -48,31 +47,25 @@ def make(name: str, objective, **changes) -> Estimator:
     return estimators.make_estimator(name, **options)
 
 
-def run(name: str, objective, theta, *, samples: int = SAMPLES, seed: int = 3, **changes) -> GradientEstimate:
-    estimator = make(name, objective, **changes)
-    program = jax.jit(lambda key: estimators.estimate(estimator, objective, jnp.asarray(theta), key, samples))
-    return program(jax.random.key(seed))
+def run_all(chosen: dict[str, Estimator], objective, theta, samples: int = SAMPLES) -> dict[str, GradientEstimate]:
+    """What each gives of the same batches."""
+    needed = estimators.oracles_of(chosen.values())
+    drawn = estimators.draw(needed, objective, jnp.asarray(theta), jax.random.key(3), samples)
+    return {name: jax.jit(each)({oracle: drawn[oracle] for oracle in each.needs}) for name, each in chosen.items()}
 
 
-def run_all(names: Iterable[str], objective, theta) -> dict[str, GradientEstimate]:
-    """What `run` gives for each, by one program: the batches that several need are drawn once."""
-    chosen = {name: make(name, objective) for name in names}
-
-    @jax.jit
-    def program(key):
-        needed = estimators.oracles_of(chosen.values())
-        drawn = estimators.draw(needed, objective, jnp.asarray(theta), key, SAMPLES)
-        return {name: each({oracle: drawn[oracle] for oracle in each.needs}) for name, each in chosen.items()}
-
-    return program(jax.random.key(3))
+def run(name: str, objective, theta, *, samples: int = SAMPLES, **changes) -> GradientEstimate:
+    return run_all({name: make(name, objective, **changes)}, objective, theta, samples)[name]
 
 
 @pytest.fixture(scope="module")
 def lots() -> dict[str, dict[str, GradientEstimate]]:
     """Every estimator on a feedback policy and on an open loop, both smooth."""
+    smooth = objectives.quadratic(objectives.HESSIAN, 0.7)
+    every = {name: make(name, FEEDBACK) for name in ESTIMATORS if name != "delta"}
     return {
-        "feedback": run_all([name for name in ESTIMATORS if name != "delta"], FEEDBACK, THETA),
-        "open loop": run_all(ESTIMATORS, objectives.quadratic(HESSIAN, 0.7), [1.5, -2.0, 1.0]),
+        "feedback": run_all(every, FEEDBACK, THETA),
+        "open loop": run_all({name: make(name, smooth) for name in ESTIMATORS}, smooth, [1.5, -2.0, 1.0]),
     }
 
 
@@ -81,11 +74,7 @@ def lots() -> dict[str, dict[str, GradientEstimate]]:
 def test_every_estimator_is_unbiased_where_the_objective_is_smooth(case: str, name: str, lots) -> None:
     if (case, name) == ("feedback", "delta"):
         pytest.skip("its mean is known for noise on theta itself only")
-    exact = (
-        jax.grad(FEEDBACK.expected_cost)(jnp.asarray(THETA))
-        if case == "feedback"
-        else HESSIAN @ np.array([1.5, -2.0, 1.0])
-    )
+    exact = objectives.of_feedback(THETA)[1] if case == "feedback" else objectives.HESSIAN @ np.array([1.5, -2.0, 1.0])
     estimate = lots[case][name]
     z = (np.asarray(estimate.mean) - np.asarray(exact)) / np.asarray(estimate.standard_error)
     assert np.all(np.abs(z) < 4.0), z
@@ -118,7 +107,7 @@ def test_estimators_at_a_jump(name: str) -> None:
 @pytest.mark.parametrize("baseline", ["none", "zero_noise", "leave_one_out"])
 def test_costs_to_go_are_unbiased_with_every_baseline(baseline: str) -> None:
     estimate = run("zobg_to_go", FEEDBACK, THETA, samples=400_000, baseline=baseline)
-    assert_mean_is(estimate.per_sample, jax.grad(FEEDBACK.expected_cost)(jnp.asarray(THETA)), resolution=0.1)
+    assert_mean_is(estimate.per_sample, objectives.of_feedback(THETA)[1], resolution=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -126,29 +115,17 @@ def few() -> tuple[Differentiation, StepDifferentiation, Linearisation, StepEval
     """The same 40 rollouts in every form."""
     theta, keys = jnp.asarray(THETA), jax.random.split(jax.random.key(5), 40)
 
-    @jax.jit
-    def draw(keys):
-        methods = ("differentiate", "differentiate_steps", "linearise", "evaluate_steps", "evaluate")
-        return tuple(getattr(FEEDBACK, name)(theta, jax.random.clone(keys)) for name in methods)
-
-    return draw(keys)
-
-
-def test_all_kinds_of_batches_agree_on_the_same_rollouts(few) -> None:
-    differentiation, by_step, linearisation, steps, evaluation = few
-    pulled = pull_back(by_step.noise_gradient, by_step.policy_jacobian)
-    np.testing.assert_allclose(pulled, differentiation.gradient, rtol=1e-12)
-    np.testing.assert_allclose(truncated_first_order(linearisation, 3).per_sample, differentiation.gradient, rtol=1e-12)
-    np.testing.assert_allclose(steps.value_to_go[:, 0], evaluation.value, rtol=1e-13)
-    np.testing.assert_allclose(pull_back(steps.noise_score, steps.policy_jacobian), evaluation.score, rtol=1e-12)
+    methods = ("differentiate", "differentiate_steps", "linearise", "evaluate_steps", "evaluate")
+    return tuple(getattr(FEEDBACK, name)(theta, jax.random.clone(keys)) for name in methods)
 
 
 @pytest.mark.parametrize("window", [1, 2])
 def test_a_truncated_adjoint_is_a_sum_over_windows(few, window: int) -> None:
     """Against forward differentiation of each window's costs alone, from the states where it begins."""
     linearisation = few[2]
-    theta, keys = jnp.asarray(THETA), jax.random.split(jax.random.key(5), 40)
-    starts, noise = jax.vmap(FEEDBACK.sample)(keys)
+    keys = jax.random.split(jax.random.key(5), 40)
+    starts = jax.vmap(lambda key: objectives.draw_start(split_sample_key(key)[0]))(keys)
+    noise = FEEDBACK.sigma**2 * linearisation.steps.noise_score
     cuts = [*range(0, FEEDBACK.horizon, window), FEEDBACK.horizon]
 
     def cost(theta: Array, start: Array, noise: Array) -> Array:
@@ -157,13 +134,13 @@ def test_a_truncated_adjoint_is_a_sum_over_windows(few, window: int) -> None:
             state = jax.lax.stop_gradient(state)
             for step in range(low, high):
                 control = theta.reshape(2, 2) @ state + noise[step]
-                total += state @ FEEDBACK.state_cost @ state + control @ FEEDBACK.control_cost @ control
-                state = jnp.asarray(FEEDBACK.transition) @ state + jnp.asarray(FEEDBACK.control) @ control
+                total += state @ SYSTEM.state_weight @ state + control @ SYSTEM.control_weight @ control
+                state = jnp.asarray(SYSTEM.transition) @ state + jnp.asarray(SYSTEM.control) @ control
             if high == FEEDBACK.horizon:
-                total += state @ FEEDBACK.state_cost @ state
+                total += state @ SYSTEM.final_weight @ state
         return total
 
-    expected = jax.jit(jax.vmap(jax.grad(cost), in_axes=(None, 0, 0)))(theta, starts, noise)
+    expected = jax.jit(jax.vmap(jax.grad(cost), in_axes=(None, 0, 0)))(jnp.asarray(THETA), starts, noise)
     np.testing.assert_allclose(truncated_first_order(linearisation, window).per_sample, expected, rtol=1e-11)
 
 
@@ -223,7 +200,7 @@ def test_lost_samples_do_not_spoil_the_rest(few) -> None:
 
 def test_ddcg_is_exact_on_quadratics_and_sees_a_jump() -> None:
     """Without tolerance, a quadratic is just at the boundary: both sides agree within sampling, 0.3 %."""
-    objective, theta = objectives.quadratic(HESSIAN, 0.7), jnp.array([0.15, -0.2, 0.1])
+    objective, theta = objectives.quadratic(objectives.HESSIAN, 0.7), jnp.array([0.15, -0.2, 0.1])
     keys = jax.random.split(jax.random.key(6), 400_000)
     batch, evaluation = objective.differentiate_steps(theta, keys), objective.evaluate(theta, jax.random.clone(keys))
     gradients = np.asarray(batch.noise_gradient[:, 0])
@@ -236,7 +213,7 @@ def test_ddcg_is_exact_on_quadratics_and_sees_a_jump() -> None:
 
 
 def test_clipping_bounds_every_sample_and_its_bias() -> None:
-    objective, theta = objectives.quadratic(HESSIAN, 0.7), [1.5, -2.0, 1.0]
+    objective, theta = objectives.quadratic(objectives.HESSIAN, 0.7), [1.5, -2.0, 1.0]
     free, clipped = run("fobg", objective, theta), run("fobg_clipped", objective, theta, max_norm=2.0)
     norms = np.linalg.norm(free.per_sample, axis=1)
     np.testing.assert_allclose(np.linalg.norm(clipped.per_sample, axis=1), np.minimum(norms, 2.0), rtol=1e-12)
@@ -272,16 +249,3 @@ def test_a_noise_density_and_its_score(name: str) -> None:
     spread = np.asarray([z.std(), score.std()])[:, None] / np.sqrt(len(z))
     assert np.all(np.abs([z.mean(), score.mean()])[:, None] < 4 * spread)
     assert noise.name == name and noise.information >= 1.0
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "student" else []) for name in NOISES]
-)
-def test_zeroth_order_is_unbiased_under_every_noise(name: str) -> None:
-    """d/dtheta E[(theta + s z)^3] = 3 (theta^2 + s^2) for any density of variance 1 without skew."""
-    noise, sigma, theta = NOISES[name], 0.5, 1.0
-    z = noise.draw(jax.random.key(8), (2_000_000, 1), jnp.float64)
-    value = (theta + sigma * z[:, 0]) ** 3
-    batch = Evaluation(value, noise.score(z) / sigma, jnp.full(len(z), theta**3))
-    estimate = jax.jit(lambda batch: estimators.zeroth_order(batch, "zero_noise"))(batch)
-    assert_mean_is(estimate.per_sample, [3 * (theta**2 + sigma**2)])

@@ -15,7 +15,6 @@ from estimators import (
     delta_control_variate,
     first_order,
     interpolate,
-    summarise,
     zeroth_order,
 )
 from tests.estimators import objectives
@@ -136,33 +135,6 @@ def test_relaxed_heaviside_first_order_variance_grows_as_one_over_width(width: f
     limit = float(objectives.heaviside_gradient(theta, sigma)[0])
     # width * variance -> grad F: the gap is the hit probability; grad F itself changes by width^2
     np.testing.assert_allclose(exact * width, limit, rtol=hit + width**2 / sigma**2)
-
-
-def test_variance_from_empirical_bias_bounds_every_population():
-    """Var z >= Delta_0^2/beta and (1-beta) Delta^2/beta, over populations of 12 equally likely vectors."""
-    rng = np.random.default_rng(2)
-    rows = rng.normal(size=(500, 12, 2)) * 10 ** rng.uniform(-2, 2, size=(500, 12, 1))
-    estimates = jax.vmap(summarise)(jnp.asarray(rows))
-    variances = np.asarray(estimates.variance) * 11 / 12  # of the population
-    tightest = 0.0
-    for population, variance in zip(rows, variances, strict=True):
-        for outside in range(1, 12):
-            beta, mean = outside / 12, population.mean(0)
-            gap = np.linalg.norm(population[outside:].mean(0) - mean)
-            reduced = max(0.0, (1 - beta) * gap - beta * np.linalg.norm(mean))
-            assert variance >= reduced**2 / beta * (1 - 1e-12)
-            assert variance >= (1 - beta) * gap**2 / beta * (1 - 1e-12)
-            tightest = max(tightest, (1 - beta) * gap**2 / beta / variance)
-    assert tightest > 0.9  # a variance too small by a tenth would have been seen
-
-
-def test_zeroth_order_variance_bound_is_attained_by_a_constant_value():
-    """B_V^2 B_pi^2 H m / sigma^2 with noise dimension m; H n, for one state, would be too small."""
-    horizon, controls, bound, sigma = 4, 3, 2.0, 0.5
-    noise = sigma * jax.vmap(lambda key: jax.random.normal(key, (horizon * controls,)))(keys(8))
-    batch = Evaluation(jnp.full(SAMPLES, bound), noise / sigma**2, jnp.zeros(SAMPLES))
-    estimate = zeroth_order(batch, "none")
-    assert_variance_is(estimate, np.zeros(horizon * controls), bound**2 * horizon * controls / sigma**2)
 
 
 @pytest.mark.parametrize("num_samples", [2, 8, 32])

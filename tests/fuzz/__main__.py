@@ -6,18 +6,15 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import pytest
 
+from experiments.pages import write_tables
 from mjx_study import configure
 from mjx_study.cli import options as of_commands
 from mjx_study.table import markdown_table
 from tests.fuzz import FUZZERS, fuzz
 from tests.fuzz.answers import Row
-from tests.planted.__main__ import MARK as END
-
-BEGIN: Final = "<!-- from here on: make fuzz -->\n"
 
 
 def timed(kind: str, folder: Path, share: float) -> Row:
@@ -34,13 +31,7 @@ def markdown(rows: Sequence[Row]) -> str:
     """Format the table of the page."""
     tried, wrong = sum(row.inputs for row in rows), sum(len(row.wrong) for row in rows)
     table = markdown_table([(row.kind, row.inputs, len(row.wrong)) for row in rows], ("input", "tried", "wrong"))
-    return f"{tried:,} inputs, {wrong} answered wrongly.\n\n{table}\n"
-
-
-def put_into(page: Path, table: str) -> None:
-    """Replace the table of a page, which stands between its marks."""
-    head, _, rest = page.read_text().partition(BEGIN)
-    page.write_text(f"{head}{BEGIN}\n{table}\n{END}{rest.partition(END)[2]}")
+    return f"{tried:,} inputs, {wrong} answered wrongly.\n\n{table}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("\n".join(line for row in rows for line in row.wrong))
     print(markdown(rows))
     if options.page is not None:
-        put_into(options.page, markdown(rows))
+        write_tables(options.page, {"fuzz": markdown(rows)})
     return int(any(row.wrong for row in rows))
 
 

@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.disk import temporary_name
-from mjx_study.storage.cell_files import digest_of_arrays
+from mjx_study.storage.arrays import digest_of_arrays
 from mjx_study.storage.folder import Store, load_study
 from mjx_study.storage.manifest import sealed
 from tests.faults import put_no_file
@@ -63,7 +63,7 @@ def rewritten(folder: Path, document: dict[str, Any], cells: dict[int, dict[str,
             store.file(index).write(arrays, {"jax": "1"})
 
 
-Forgery = Callable[[Path, Path], None]
+Forgery = Callable[[Path, Path], object]
 """Forges a study in a folder, given one outside it that must stay as it is."""
 
 
@@ -191,61 +191,53 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
         yield f"versions of a cell: {name}", written, True
 
 
+def _sparse(path: Path, _: Path) -> None:
+    with open(path, "wb") as file:
+        file.truncate(10**12)
+
+
+def _unreadable(path: Path, _: Path) -> None:
+    path.write_bytes(b"x")
+    os.chmod(path, 0)
+
+
+ENTRIES: Final[dict[str, Forgery]] = {
+    **{kind: lambda path, _, kind=kind: put_no_file(path, kind) for kind in ("fifo", "socket", "device", "folder")},
+    "a link to a file": lambda path, outside: path.symlink_to(outside / "file"),
+    "a link to nothing": lambda path, outside: path.symlink_to(outside / "new"),
+    "a link to itself": lambda path, _: path.symlink_to(path),
+    "a link to a folder": lambda path, outside: path.symlink_to(outside),
+    "a terabyte of nothing": _sparse,
+    "unreadable": _unreadable,
+}
+"""What stands in place of a file."""
+
+
 def entries(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
     """Forgeries of what lies in a folder: links, pipes, sockets, devices, folders and sparse files."""
-    places = ("study.json", "study.lock", "results.nc", "cells/00000.npz", "cells/00001.part.npz")
+    for place in ("study.json", "study.lock", "results.nc", "cells/00000.npz", "cells/00001.part.npz"):
+        for name, put in ENTRIES.items():
 
-    def cleared(at: Path, place: str) -> Path:
-        if "00001" in place:
-            (at / "cells" / "00001.npz").unlink()
-        path = at / place
-        path.unlink(missing_ok=True)
-        return path
+            def replaced_file(at: Path, outside: Path, place: str = place, put: Forgery = put) -> None:
+                if "00001" in place:
+                    (at / "cells" / "00001.npz").unlink()
+                (at / place).unlink(missing_ok=True)
+                put(at / place, outside)
 
-    for place in places:
-        needed = place in ("study.json", "cells/00000.npz")
-        for kind in ("fifo", "socket", "folder", "device"):
-            yield f"{place}: {kind}", lambda at, _, p=place, k=kind: put_no_file(cleared(at, p), k), needed
-        for kind in ("a file", "nothing", "itself", "a folder"):
-
-            def linked(at: Path, outside: Path, place: str = place, kind: str = kind) -> None:
-                path = cleared(at, place)
-                targets = {"a file": outside / "file", "nothing": outside / "new", "itself": path, "a folder": outside}
-                path.symlink_to(targets[kind])
-
-            yield f"{place}: a link to {kind}", linked, needed
-
-        def sparse(at: Path, _: Path, place: str = place) -> None:
-            with open(cleared(at, place), "wb") as file:
-                file.truncate(10**12)
-
-        yield f"{place}: a terabyte of nothing", sparse, needed
-
-        def unreadable(at: Path, _: Path, place: str = place) -> None:
-            cleared(at, place).write_bytes(b"x")
-            os.chmod(at / place, 0)
-
-        yield f"{place}: unreadable", unreadable, needed
+            yield f"{place}: {name}", replaced_file, place in ("study.json", "cells/00000.npz")
 
     def moved(at: Path, outside: Path) -> None:
         shutil.copytree(at / "cells", outside / "cells", dirs_exist_ok=True)
         shutil.rmtree(at / "cells")
 
-    def cells_linked(at: Path, outside: Path) -> None:
-        shutil.rmtree(at / "cells")
-        (at / "cells").symlink_to(outside)
-
-    def cells_of(kind: str) -> Forgery:
-        def forge(at: Path, _: Path) -> None:
-            shutil.rmtree(at / "cells")
-            put_no_file(at / "cells", kind)
-
-        return forge
-
-    yield "cells: a link", cells_linked, True
     yield "cells: moved", moved, False
-    for kind in ("fifo", "socket", "device"):
-        yield f"cells: {kind}", cells_of(kind), False
+    for name in ("a link to a folder", "fifo", "socket", "device"):
+
+        def cells_replaced(at: Path, outside: Path, put: Forgery = ENTRIES[name]) -> None:
+            shutil.rmtree(at / "cells")
+            put(at / "cells", outside)
+
+        yield f"cells: {name}", cells_replaced, "link" in name
 
     def leftovers(at: Path, outside: Path) -> None:
         for target in (outside / "file", outside / "new"):
@@ -260,11 +252,8 @@ def entries(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
         b'{"format": 4' + b" " * 10**6 + b"}", b'{"format": 1' + b"0" * 5000 + b"}",
     )  # fmt: skip
     for content in contents:
-
-        def replaced(at: Path, _: Path, content: bytes = content) -> None:
-            (at / "study.json").write_bytes(content)
-
-        yield f"study.json: {content[:16]!r}", replaced, True
+        write = lambda at, _, content=content: (at / "study.json").write_bytes(content)  # noqa: E731
+        yield f"study.json: {content[:16]!r}", write, True
 
 
 FORGERIES: Final = {

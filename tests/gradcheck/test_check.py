@@ -2,17 +2,17 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
-import mujoco
 import pytest
 
 from mjx_study import cli
 from mjx_study.gradcheck import Finding, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.simulation import dynamics
-from mjx_study.simulation.scene import load_scene, put_scene
+from mjx_study.simulation.scene import load_scene
 from mjx_study.tasks import make_task
-from tests.scenes import plain_warm_start
+from tests.scenes import plain_warm_start, scene_of
 
 CONVERGED = 'iterations="100" ls_iterations="50"'
 BALL = (
@@ -22,7 +22,7 @@ BALL = (
 
 def check(xml: str, *families: str, states: int = 1, **options: object) -> GradcheckReport:
     """The report on a scene."""
-    scene = put_scene(mujoco.MjModel.from_xml_string(f"<mujoco>{xml}</mujoco>"), "scene")
+    scene = scene_of(f"<mujoco>{xml}</mujoco>")
     plan = plan_scene_gradcheck(scene, families or None, seed=0, states=states, horizon=20, **options)  # type: ignore[arg-type]
     return gradcheck(plan)
 
@@ -208,36 +208,27 @@ def test_stock_derivatives_are_checked_apart() -> None:
     assert report.steps[0].verdict == "right" and report.steps[0].stock == pytest.approx(1.0)
 
 
-def test_a_stiffness_needs_the_pair_that_it_acts_on() -> None:
-    scene = load_scene("pusher")
-    for families, stiffnesses, message in (
-        (["penalty"], None, "`pair`"),
-        (["penalty"], [10.0], "`pair`"),
-        (["mujoco_default"], [10.0], "`stiffness` has no effect on contact mujoco_default"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            plan_scene_gradcheck(scene, families, stiffnesses, seed=0)
-    plan = plan_scene_gradcheck(scene, ["penalty"], [10.0, 100.0], seed=0, pair=("pusher", "slider"))
-    assert [cell.stiffness for cell in plan.cells] == [10.0, 100.0]
-    with pytest.raises(ValueError, match="no geom 'nothing'"):
-        plan_scene_gradcheck(scene, ["penalty"], [10.0], seed=0, pair=("pusher", "nothing"))
-
-
 def test_plans_are_refused() -> None:
-    task = make_task("pusher", horizon=3)
+    """Of stiffnesses without the pair that they act on, among others."""
+    scene, task = load_scene("pusher"), make_task("pusher", horizon=3)
     with jax.enable_x64(False):
         single = make_task("pusher", horizon=3)
-    with pytest.raises(ValueError, match="needs float64"):
-        plan_gradcheck(single, ["penalty"], [10.0], seed=0)
-    with pytest.raises(ValueError, match="no contact model"):
-        plan_gradcheck(task, [], [10.0], seed=0)
-    with pytest.raises(ValueError, match="states must be at least 1"):
-        plan_gradcheck(task, ["penalty"], [10.0], seed=0, states=0)
-    fixed = put_scene(
-        mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'), "stone"
+    fixed = scene_of('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>')
+    plan = plan_scene_gradcheck(scene, ["penalty"], [10.0, 100.0], seed=0, pair=("pusher", "slider"))
+    assert [cell.stiffness for cell in plan.cells] == [10.0, 100.0]
+    refused: tuple[Any, ...] = (
+        (plan_scene_gradcheck, (scene, ["penalty"]), {}, "`pair`"),
+        (plan_scene_gradcheck, (scene, ["penalty"], [10.0]), {}, "`pair`"),
+        (plan_scene_gradcheck, (scene, ["mujoco_default"], [10.0]), {}, "`stiffness` has no effect on .* mujoco_def"),
+        (plan_scene_gradcheck, (scene, ["penalty"], [10.0]), {"pair": ("pusher", "nothing")}, "no geom 'nothing'"),
+        (plan_scene_gradcheck, (fixed,), {}, "no degree of freedom"),
+        (plan_gradcheck, (single, ["penalty"], [10.0]), {}, "needs float64"),
+        (plan_gradcheck, (task, [], [10.0]), {}, "no contact model"),
+        (plan_gradcheck, (task, ["penalty"], [10.0]), {"states": 0}, "states must be at least 1"),
     )
-    with pytest.raises(ValueError, match="no degree of freedom"):
-        plan_scene_gradcheck(fixed, seed=0)
+    for make, arguments, options, message in refused:
+        with pytest.raises(ValueError, match=message):
+            make(*arguments, seed=0, **options)
 
 
 @pytest.mark.parametrize(
@@ -252,11 +243,7 @@ def test_plans_are_refused() -> None:
     ],
 )
 def test_invalid_requests_are_refused_in_one_line(
-    arguments: list[str],
-    message: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ball.xml").write_text(f"<mujoco><worldbody>{BALL.format(name='x', axis='1 0 0')}</worldbody></mujoco>")

@@ -4,7 +4,6 @@ import dataclasses
 from functools import cache
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -20,7 +19,7 @@ from mjx_study.gradcheck.diagnosis import (
     worst_verdict,
 )
 from mjx_study.gradcheck.differences import Differences
-from mjx_study.simulation.scene import put_scene
+from tests.scenes import scene_of
 
 CART = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size=".1"/></body>
 </worldbody><actuator><motor name="push" joint="x"/></actuator></mujoco>"""
@@ -29,7 +28,7 @@ CART = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis
 @cache
 def layout() -> Coordinates:
     """One slide joint and one motor: outputs (qpos, qvel), inputs (qpos, qvel, ctrl)."""
-    return make_coordinates(put_scene(mujoco.MjModel.from_xml_string(CART), "cart"), None)
+    return make_coordinates(scene_of(CART), None)
 
 
 TRUE = np.array([[1.0, 0.01, 1e-4], [0.5, 1.0, 0.01]])
@@ -58,11 +57,6 @@ def verdict(
     codes = judge(layout(), derivative, found, exact)
     assert (np.delete(codes, 3) == diagnosis.RIGHT).all()
     return VERDICTS[codes[1, 0]]
-
-
-def test_names_of_the_layout() -> None:
-    assert [str(source) for source in layout().inputs] == ["qpos[x]", "qvel[x]", "ctrl[push]"]
-    assert [str(output) for output in layout().outputs] == ["qpos[x]", "qvel[x]"]
 
 
 NAN, INF = float("nan"), float("inf")

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
@@ -12,7 +11,7 @@ from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, moves, solution_noise, take_differences
 from mjx_study.gradcheck.programs import ContactCase, Programs
 from mjx_study.simulation.engine import HostState
-from mjx_study.simulation.scene import put_scene
+from tests.scenes import scene_of
 
 
 def read(function: Callable[[np.ndarray], np.ndarray], noise: float = 0.0) -> Differences:
@@ -104,7 +103,7 @@ def test_forces_that_cancel_are_rounded() -> None:
     pull = '<joint joint1="x" polycoef="{} 0 0 0 0"/>'
     xml = f"""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
     <equality>{pull.format(1e5)}{pull.format(1 - 1e5)}</equality><actuator><motor joint="x"/></actuator></mujoco>"""
-    layout = make_coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
+    layout = make_coordinates(scene_of(xml), None)
     programs, case, ladder = Programs(layout), ContactCase(None, layout.scales), moves(np.eye(3)[2:])
     nothing, zero = np.zeros(0), np.zeros(1)
     state = HostState(zero, zero, nothing, zero, zero)

@@ -8,7 +8,8 @@ from mjx_study.gradcheck.coverage import Coverage, Reach, contact_parts
 from mjx_study.gradcheck.states import Sample, states_of
 from mjx_study.simulation.contact_pair import contact_pairs
 from mjx_study.simulation.engine import host_state
-from mjx_study.simulation.scene import Scene, load_scene, put_scene
+from mjx_study.simulation.scene import Scene, load_scene
+from tests.scenes import scene_of
 
 FLOOR = '<geom name="floor" type="plane" size="5 5 .1"/>'
 # A puck that rests on the floor and does not slide by itself; an arm that hangs far from its limits; dry friction.
@@ -22,9 +23,7 @@ def sampled(world: str, count: int, option: str = "", **options) -> tuple[list[S
 
 
 def scene(world: str, option: str = "") -> Scene:
-    return put_scene(
-        mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{world}</worldbody></mujoco>"), "scene"
-    )
+    return scene_of(f"<mujoco>{option}<worldbody>{world}</worldbody></mujoco>")
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])

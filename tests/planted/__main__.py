@@ -5,7 +5,6 @@ The tests that are likely to see it run first; if they pass gradcheck runs, and 
 
 import argparse
 import dataclasses
-import json
 import os
 import shutil
 import subprocess
@@ -17,16 +16,15 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
+from experiments.pages import write_tables
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.table import format_table, markdown_table
-from tests.planted import DEFECTS
-from tests.planted.defect import Defect, plant
+from tests.planted.defects import DEFECTS, Defect, plant
 from tests.planted.models import MODELS
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = (".git", ".venv*", ".*cache*", ".hypothesis", "__pycache__", "results", "build", "dist")
 LIMIT = 900.0  # [s] for one command
-MARK = "<!-- from here on: make defects -->\n"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,18 +35,11 @@ class Verdict:
         defect: that was planted.
         test: the first fast test that failed.
         gradcheck: what gradcheck said.
-        seconds: that it took.
     """
 
     defect: Defect
-    test: str | None
+    test: str
     gradcheck: str | None
-    seconds: float
-
-    @property
-    def caught(self) -> bool:
-        """Whether anything saw it."""
-        return bool(self.test or self.gradcheck)
 
 
 @contextmanager
@@ -108,70 +99,50 @@ def clean_gradcheck(model: str) -> str:
         return wrong_by_gradcheck(tree, model)
 
 
-def judge(defect: Defect, known: Verdict | None, *, everything: bool) -> Verdict:
+def judge(defect: Defect, *, everything: bool) -> Verdict:
     """Plant a defect and see what catches it.
 
     Args:
         defect: to plant.
-        known: what an earlier run found; only what it lacks is run.
         everything: whether to run gradcheck though a test has caught it.
 
     Raises:
         RuntimeError: gradcheck finds fault with the model as it is, or pytest cannot run.
     """
-    if known and (known.gradcheck is not None or defect.model is None or not everything):
-        return known
-    start = time.monotonic()
-    test, checked, before = (known.test, known.gradcheck, known.seconds) if known else (None, None, 0.0)
     with copy_of_the_tree() as tree:
         plant(defect, tree)
-        if test is None:
-            test = failing_test(tree, *defect.tests)
-        if checked is None and defect.model is not None and (everything or not test):
+        test, checked = failing_test(tree, *defect.tests), None
+        if defect.model is not None and (everything or not test):
             if wrong := clean_gradcheck(defect.model):
                 raise RuntimeError(f"gradcheck must pass {defect.model} without a defect, and says {wrong}")
             checked = wrong_by_gradcheck(tree, defect.model)
         if not test and not checked:
             test = failing_test(tree, *(f"--deselect={name}" for name in defect.tests))
-    return Verdict(defect, test, checked, before + time.monotonic() - start)
-
-
-def read_results(path: Path | None) -> dict[str, Verdict]:
-    """Verdicts by the defect's name, of an earlier run over the same code."""
-    lines = path.read_text().splitlines() if path is not None and path.is_file() else []
-    documents = [json.loads(line) for line in lines]
-    defects = {each.name: each for each in DEFECTS}
-    return {d["defect"]: Verdict(defects[d["defect"]], d["test"], d["gradcheck"], d["seconds"]) for d in documents}
+    return Verdict(defect, test, checked)
 
 
 def row(verdict: Verdict) -> list[str]:
     """Of the table: name, file, what caught it."""
-    told = {None: "not run", "": "passes"}
-    defect = verdict.defect
-    checked = "-" if defect.model is None else told.get(verdict.gradcheck, verdict.gradcheck or "")
-    return [defect.name, defect.file, told.get(verdict.test, verdict.test or "").removeprefix("tests/"), checked]
-
-
-def summary(verdicts: Sequence[Verdict]) -> str:
-    """How many were caught, by what."""
-    tested = [verdict.test for verdict in verdicts if verdict.test is not None]
-    checked = [verdict.gradcheck for verdict in verdicts if verdict.gradcheck is not None]
-    missed = sum(verdict.test == "" and not verdict.caught for verdict in verdicts)
-    return (
-        f"{len(verdicts)} defects: the fast tests caught {sum(map(bool, tested))} of {len(tested)}, gradcheck "
-        f"{sum(map(bool, checked))} of {len(checked)}; {missed} caught by nothing"
-    )
+    defect, checked = verdict.defect, verdict.gradcheck
+    said = "-" if defect.model is None else "not run" if checked is None else checked or "passes"
+    return [defect.name, defect.file, verdict.test.removeprefix("tests/") or "passes", said]
 
 
 def markdown(verdicts: Sequence[Verdict]) -> str:
-    """Format the table of the page: defects by file and by what caught them."""
+    """Format the table of the page: how many were caught, by what; defects by file and by what caught them."""
     found: dict[str, tuple[list[str], list[str], list[str]]] = {}
     for verdict in verdicts:
         column = 0 if verdict.test else 1 if verdict.gradcheck else 2
         found.setdefault(verdict.defect.file, ([], [], []))[column].append(verdict.defect.name)
     rows = [(f"`{file}`", *map(", ".join, names)) for file, names in found.items()]
     table = markdown_table(rows, ("file", "caught by the fast tests", "by gradcheck alone", "by nothing"))
-    return f"{summary(verdicts)}.\n\n{table}\n"
+    tested = sum(bool(each.test) for each in verdicts)
+    checked = [each.gradcheck for each in verdicts if each.gradcheck is not None]
+    missed = sum(len(each[2]) for each in found.values())
+    return (
+        f"{len(verdicts)} defects: the fast tests caught {tested} of {len(verdicts)}, gradcheck "
+        f"{sum(map(bool, checked))} of {len(checked)}; {missed} caught by nothing.\n\n{table}"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -180,36 +151,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="the defects, without planting any")
     parser.add_argument("--only", action="append", metavar="NAME", choices=[each.name for each in DEFECTS])
     parser.add_argument("--everything", action="store_true", help="gradcheck also where a test has caught the defect")
-    parser.add_argument(
-        "--results", type=Path, metavar="FILE", help="keep verdicts there, and plant only what it lacks"
-    )
-    parser.add_argument("--known", action="store_true", help="plant nothing: the table of --results, as far as it goes")
-    parser.add_argument("--page", type=Path, metavar="FILE.md", help="put the table where the page has its mark")
+    parser.add_argument("--page", type=Path, metavar="FILE.md", help="put the table between its marks on the page")
     options = parser.parse_args(arguments)
     chosen = [each for each in DEFECTS if not options.only or each.name in options.only]
     if options.list:
         print("\n".join(format_table([[each.name, each.file, each.why] for each in chosen], ["defect", "file", "why"])))
         return 0
-    verdicts, known = [], read_results(options.results)
+    verdicts = []
     for index, defect in enumerate(chosen, 1):
-        verdict = known.get(defect.name)
-        if options.known:
-            verdicts.append(verdict or Verdict(defect, None, None, 0.0))
-            continue
-        verdict = judge(defect, verdict, everything=options.everything)
-        verdicts.append(verdict)
-        if options.results is not None and verdict is not known.get(defect.name):
-            with options.results.open("a") as file:
-                file.write(json.dumps(dataclasses.asdict(verdict) | {"defect": defect.name}) + "\n")
-        found = "caught" if verdict.caught else "CAUGHT BY NOTHING"
-        note = f"{index}/{len(chosen)} {defect.name}: {found}, {verdict.seconds:.0f} s"
+        start = time.monotonic()
+        verdicts.append(verdict := judge(defect, everything=options.everything))
+        found = "caught" if verdict.test or verdict.gradcheck else "CAUGHT BY NOTHING"
+        note = f"{index}/{len(chosen)} {defect.name}: {found}, {time.monotonic() - start:.0f} s"
         print(note, file=sys.stderr, flush=True)
     print("\n".join(format_table([row(each) for each in verdicts], ["defect", "file", "fast tests", "gradcheck"])))
-    print(summary(verdicts))
+    print(markdown(verdicts).splitlines()[0])
     if options.page is not None:
-        head = options.page.read_text().partition(MARK)[0]
-        options.page.write_text(f"{head}{MARK}\n## Planted defects\n\n{markdown(verdicts)}")
-    return 1 if any(each.test == "" and not each.caught for each in verdicts) else 0
+        write_tables(options.page, {"defects": markdown(verdicts)})
+    return int(not all(each.test or each.gradcheck for each in verdicts))
 
 
 if __name__ == "__main__":

@@ -2,13 +2,12 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_study.reference import (
     BallWall,
-    Function,
     Heaviside,
     Jump,
     MomentumTransfer,
@@ -59,9 +58,9 @@ class Square:
 
 
 class FunctionCase(NamedTuple):
-    """A function, theta and sigma."""
+    """A function, scalar but for the quadratic, theta and sigma."""
 
-    function: Function
+    function: Any
     theta: np.ndarray
     sigma: float
 

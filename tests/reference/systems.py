@@ -144,20 +144,12 @@ def tennis_events(rollout: Rollout) -> np.ndarray:
 BALL = np.array([0.6, 0.75, -0.15, -0.5, 0.2, 0.03, -0.04])  # on its way down to the paddle
 ROLLOUTS = {
     "pusher": RolloutCase(
-        Pusher(100.0),
-        np.array([0.0, 0.98, 0.1, -0.2]),
-        0.3 * RNG.standard_normal((60, 1)),
-        np.array([[-0.8, 0.5, -0.3, 0.1]]),
-        _pusher_events,
-        1e-5,
+        Pusher(100.0), np.array([0.0, 0.98, 0.1, -0.2]), 0.3 * RNG.standard_normal((60, 1)),
+        np.array([[-0.8, 0.5, -0.3, 0.1]]), _pusher_events, 1e-5,
     ),
     "sliding_box": RolloutCase(
-        SlidingBox(),
-        np.array([0.0, 0.005, 0.1, 0.15]),
-        0.6 + 0.3 * RNG.standard_normal((100, 1)),
-        np.array([[-0.2, 0.4, -0.3, 0.1]]),
-        _sliding_box_events,
-        5e-5,
+        SlidingBox(), np.array([0.0, 0.005, 0.1, 0.15]), 0.6 + 0.3 * RNG.standard_normal((100, 1)),
+        np.array([[-0.2, 0.4, -0.3, 0.1]]), _sliding_box_events, 5e-5,
     ),
     "double_pendulum": RolloutCase(
         DoublePendulum(timestep=0.01), np.array([1.5, 0.2, 2.0, -3.0]), np.zeros((100, 0)), None, _no_events
@@ -166,18 +158,11 @@ ROLLOUTS = {
         Tennis(), BALL, 0.05 * RNG.standard_normal((45, 3)), 0.05 * RNG.standard_normal((3, 7)), tennis_events, 1e-5
     ),
     "linear_quadratic": RolloutCase(
-        LINEAR_QUADRATIC,
-        RNG.standard_normal(3),
-        RNG.standard_normal((8, 2)),
-        0.3 * RNG.standard_normal((2, 3)),
+        LINEAR_QUADRATIC, RNG.standard_normal(3), RNG.standard_normal((8, 2)), 0.3 * RNG.standard_normal((2, 3)),
         _no_events,
     ),
     "pusher, impedance": RolloutCase(
-        ImpedancePusher(100.0),
-        np.array([0.0, 0.98, 0.1, -0.2]),
-        INPUTS["swell"],
-        np.zeros((1, 4)),
-        _pusher_events,
+        ImpedancePusher(100.0), np.array([0.0, 0.98, 0.1, -0.2]), INPUTS["swell"], np.zeros((1, 4)), _pusher_events,
         1e-5,
     ),
-}
+}  # fmt: skip

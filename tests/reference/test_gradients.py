@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mjx_study.reference import Rollout, System, Tennis, roll_out, value_and_gradients
+from mjx_study.reference import Rollout, Tennis, roll_out, value_and_gradients
 from tests.pusher_fixtures import relative
 from tests.reference.systems import ROLLOUTS, STEPS, RolloutCase, StepCase, differentiate
 
@@ -11,11 +11,6 @@ TOLERANCE = 1e-8  # relative to a column's norm; truncation and rounding of the 
 STEP = 1e-4
 steps = pytest.mark.parametrize("case", STEPS.values(), ids=STEPS.keys())
 rollouts = pytest.mark.parametrize("case", ROLLOUTS.values(), ids=ROLLOUTS.keys())
-
-
-@steps
-def test_is_a_system(case: StepCase):
-    assert isinstance(case.system, System)
 
 
 def test_impacts_happen_inside_the_steps():

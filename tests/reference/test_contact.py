@@ -1,12 +1,10 @@
-"""The pusher's contact as a law of nature, which conserves momentum; and the published order of variances."""
+"""Contact of the pusher and of the sliding box as laws of nature; their numbers are in `test_published`."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from estimators import first_order, variance_interval, zeroth_order
-from mjx_study.reference import Pusher, ReferenceObjective, roll_out
-from tests.pusher_fixtures import HORIZON, INPUTS, SIGMA, START, sample_keys
+from mjx_study.reference import Pusher, SlidingBox, roll_out
+from tests.pusher_fixtures import HORIZON, INPUTS, START
 
 
 def test_equal_masses_exchange_their_velocities():
@@ -40,18 +38,13 @@ def test_contact_only_pushes():
     assert pulled[-1, 0] < -0.1
 
 
-def reference_variances(stiffness: float):
-    """99 % intervals of the variance of one sample, zeroth and first order."""
-    objective = ReferenceObjective(Pusher(stiffness), tuple(START), HORIZON, SIGMA)
-    theta = jnp.full(HORIZON, 0.1)
-    zeroth = zeroth_order(objective.evaluate(theta, sample_keys(300, 0)), "zero_noise")
-    first = first_order(objective.differentiate(theta, sample_keys(300, 1)))
-    return variance_interval(zeroth, 0.99), variance_interval(first, 0.99)
-
-
-def test_stiffness_turns_the_order_of_variances():
-    """The figure: at K = 10 first-order gradients vary less than zeroth-order ones, at K = 1000 more."""
-    (zeroth_low, _), (_, first_high) = reference_variances(10.0)
-    assert first_high < zeroth_low
-    (_, zeroth_high), (first_low, _) = reference_variances(1000.0)
-    assert zeroth_high < first_low
+def test_friction_is_internal_and_limited():
+    """Total momentum follows the force alone; the box is never driven by more than mu v_s."""
+    system, rng = SlidingBox(), np.random.default_rng(0)
+    controls = 0.3 + 0.3 * rng.standard_normal((400, 1))
+    states = roll_out(system, np.zeros(4), controls).states
+    momentum = system.mass * states[:, 2:].sum(axis=1)
+    np.testing.assert_allclose(momentum[1:], system.timestep * np.cumsum(controls), rtol=1e-12)
+    force = system.mass * np.diff(states[:, 3]) / system.timestep
+    assert np.abs(force).max() == pytest.approx(system.viscosity * system.slip_tolerance)
+    assert np.all(force[~system.on_box(states[:-1])] == 0) and not system.on_box(states).all()
