@@ -40,6 +40,9 @@ class Sources:
         if self._read(path, root):
             for value in list(vars(sys.modules[module]).values()):
                 other = value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)
+                loaded = isinstance(value, types.ModuleType) and str(other).startswith(f"{module}.")
+                if loaded and is_users(module):  # by anybody; what the package itself imports follows
+                    continue
                 if isinstance(other, str) and _is_neighbour(other, module, root):
                     self.add(other)
             if is_users(module):

@@ -23,6 +23,7 @@ from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import StudyCell, StudyError, StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.files import read_theta
+from mjx_study.sources import Sources
 from mjx_study.storage.folder import Store
 from tests.documents import planned_arrays, stub_cells
 from tests.processes import run_script
@@ -267,3 +268,27 @@ def test_digests_are_the_same_in_every_process(tmp_path: Path, world: Callable[[
         env = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": str(Path(__file__).parents[1])}
         found.append(json.loads(run_script(PRINTED, *names, "stateless", cwd=tmp_path, env=env).stdout))
     assert found[0] == found[1] and len(found[0]) > 3 * len(CASES)
+
+
+def test_a_submodule_counts_where_it_is_imported_not_where_it_happens_to_be_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pkg").mkdir()
+    for name, text in {
+        "__init__": "",
+        "a": "from pkg.c import C\nfrom . import d\n",
+        "b": "",
+        "c": "C = 1",
+        "d": "",
+    }.items():
+        (tmp_path / "pkg" / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    digests = []
+    for name in ("pkg.a", "pkg.b"):
+        importlib.import_module(name)
+        sources = Sources()
+        sources.add("pkg.a")
+        digests.append(sources.digests)
+    assert digests[0] == digests[1] and set(digests[0]) == {f"pkg/{name}.py" for name in ("__init__", "a", "c", "d")}
+    for name in [each for each in sys.modules if each.partition(".")[0] == "pkg"]:
+        del sys.modules[name]
