@@ -56,12 +56,7 @@ from estimators.registry import find_estimator, make_estimator, oracles_of
 from estimators.samples import Rows
 from estimators.sampling import draw, estimate
 from estimators.statistics import norm_quantiles, summarise
-from estimators.stepwise import (
-    antithetic_cost_to_go,
-    cost_to_go,
-    discontinuity_gated,
-    stepwise_inverse_variance,
-)
+from estimators.stepwise import antithetic_cost_to_go, cost_to_go, discontinuity_gated, stepwise_inverse_variance
 from estimators.zeroth_first import (
     BASELINES,
     antithetic,

@@ -5,14 +5,7 @@ from abc import abstractmethod
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from estimators.choices import (
-    BASELINES,
-    MAX_DEVIATION,
-    PLUG_IN,
-    PUBLISHED_TOLERANCE,
-    VARIANCE_PROXIES,
-    WEIGHTS,
-)
+from estimators.choices import BASELINES, MAX_DEVIATION, PLUG_IN, PUBLISHED_TOLERANCE, VARIANCE_PROXIES, WEIGHTS
 from estimators.estimator import Estimator, option, register
 
 if TYPE_CHECKING:

@@ -14,10 +14,8 @@ BASELINES: Final = ("none", "zero_noise", LEAVE_ONE_OUT)
 """Baselines for zeroth-order samples."""
 VARIANCE_PROXIES: Final = ("variance", "second_moment", "upper_bound")
 """Choices for the variance in epsilon."""
-MAX_DEVIATION: Final = "max_deviation"
-"""Choice of the radius in epsilon that is computed from the samples."""
-PUBLISHED_TOLERANCE: Final = 0.3
-"""Tolerance of the DDCG test, as published."""
+MAX_DEVIATION: Final = "max_deviation"  # choice of the radius in epsilon that is computed from the samples
+PUBLISHED_TOLERANCE: Final = 0.3  # tolerance of the DDCG test, as published
 DENSITIES: Final = {
     "gaussian": "the paper's",
     "logistic": "heavier tails, bounded score",

@@ -12,8 +12,7 @@ from estimators.batches import AlphaChoice, GradientEstimate
 from estimators.choices import CROSS_FITTED, PLUG_IN, WEIGHTS, unknown
 from estimators.samples import Rows, weigh
 
-FEWEST_SAMPLES: Final = 4
-"""Two in each half, the fewest for a variance."""
+FEWEST_SAMPLES: Final = 4  # two in each half, the fewest for a variance
 Scalar = Float[Array, ""]
 
 

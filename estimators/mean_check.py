@@ -19,12 +19,9 @@ from estimators.registry import oracles_of
 from estimators.sampling import draw
 from estimators.statistics import summarise
 
-NODES: Final = 9
-"""Quadrature nodes along a path."""
-HALF_WIDTH_SE: Final = 3.29
-"""Half-width of a 99.9 % interval in standard errors."""
-TOLERANCE: Final = 0.05
-"""Relative error, as a share of F's difference, within which a mean counts as right."""
+NODES: Final = 9  # quadrature nodes along a path
+HALF_WIDTH_SE: Final = 3.29  # half-width of a 99.9 % interval in standard errors
+TOLERANCE: Final = 0.05  # relative error, as a share of F's difference, within which a mean counts as right
 Nodes = Float[np.ndarray, " nodes"]
 
 

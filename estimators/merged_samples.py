@@ -16,8 +16,7 @@ from jaxtyping import Array, Float, Int, Key
 from estimators.pytree import register_pytree
 from estimators.samples import Deviations
 
-EXTREMES: Final = 32
-"""Samples kept for each kind of extreme."""
+EXTREMES: Final = 32  # samples kept for each kind of extreme
 MAX_THINNED: Final = 2**14
 """Maximum number of samples of a batch whose norms are kept; larger batches are subsampled at a regular stride."""
 

@@ -4,14 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from estimators.batches import (
-    AlphaChoice,
-    Evaluation,
-    GradientEstimate,
-    StepDifferentiation,
-    StepEvaluation,
-    pull_back,
-)
+from estimators.batches import AlphaChoice, Evaluation, GradientEstimate, StepDifferentiation, StepEvaluation, pull_back
 from estimators.choices import PLUG_IN, PUBLISHED_TOLERANCE
 from estimators.interpolation import apply_choice, inverse_variance_alpha, weigh_batches
 from estimators.samples import Rows, finite_rows

@@ -18,8 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final, no_type_check
 
-FILE, VARIABLE = "file ", "variable "
-"""Prefixes of the names of inputs."""
+FILE, VARIABLE = "file ", "variable "  # prefixes of the names of inputs
 ABSENT: Final = "absent"
 OURS: Final = tuple(str(Path(__file__).resolve().parents[1] / name) + os.sep for name in ("estimators", "mjx_study"))
 STANDARD: Final = tuple({str(Path(sysconfig.get_paths()[name])) + os.sep for name in ("stdlib", "platstdlib")})

@@ -10,7 +10,6 @@ mean squared errors after one second of computing on this machine.
 
 import argparse
 import dataclasses
-import json
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
@@ -23,7 +22,7 @@ import numpy as np
 from estimators import GradientEstimate, make_estimator, oracles_of, squared_bias_of_means
 from estimators.confidence import coverage_interval
 from estimators.mean_check import TOLERANCE
-from experiments import DATA, DOCS
+from experiments import DATA, DOCS, append_line, read_lines
 from experiments.pages import write_tables
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
 from mjx_study.diagnose.measurement import ESTIMATORS, measure
@@ -54,23 +53,17 @@ CONTACTS: Final = {
 }
 LATER: Final = ("sled", "edge", "stops", "hull", "arm", "slope", "margin")
 """Models that were added after all rules had been made, with half of the contacts."""
-LIMITS: Final = ("pendulum", "stops")
-"""Models whose joints reach their limits, without contact."""
-FINE: Final = ("cart", "balls")
-"""Models that are also run at half the timestep, with the default contact."""
+LIMITS: Final = ("pendulum", "stops")  # models whose joints reach their limits, without contact
+FINE: Final = ("cart", "balls")  # models that are also run at half the timestep, with the default contact
 HORIZON: Final = 80
-SAMPLES: Final = 300
-"""Samples per batch of a diagnosis."""
-TOTAL: Final = 20_000
-"""Samples per estimator in the independent measurement."""
-SIZES: Final = (20, 200)
-"""Smallest and largest batch size in the independent measurement."""
+SAMPLES: Final = 300  # samples per batch of a diagnosis
+TOTAL: Final = 20_000  # samples per estimator in the independent measurement
+SIZES: Final = (20, 200)  # smallest and largest batch size in the independent measurement
 PARTS: Final = (8_000, 100, 500)
 """Pairs of rollouts of the reference, and numbers of samples for its control variates."""
 FACTOR: Final = 2.0
 DRAWS: Final = 1000
-SEEDS: Final = (0, 1)
-"""Seeds of the diagnosis and of the independent measurement."""
+SEEDS: Final = (0, 1)  # seeds of the diagnosis and of the independent measurement
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,8 +190,7 @@ def result(case: Case, simulator: Simulator) -> dict[str, Any]:
 
 def read() -> list[dict[str, Any]]:
     """Return the results so far, in the order of the cases."""
-    lines = RESULTS.read_text().splitlines() if RESULTS.exists() else []
-    by_name = {each["case"]: each for each in map(json.loads, lines)}
+    by_name = {each["case"]: each for each in read_lines(RESULTS)}
     return [by_name[case.name] for case in cases() if case.name in by_name]
 
 
@@ -288,17 +280,13 @@ def main() -> None:
     mujoco.set_mju_user_warning(lambda message: None)
     done, made = {each["case"] for each in read()}, {}
     for case in cases():
-        if (
-            options.page
-            or case.name in done
-            or not (not options.parts or any(part in case.name for part in options.parts))
-        ):
+        asked = not options.parts or any(part in case.name for part in options.parts)
+        if options.page or case.name in done or not asked:
             continue
         if (key := (case.model, case.halved)) not in made:
             made = {key: Simulator(task_of(case), chunk_size=chunk_for(SAMPLES, local_devices()))}
         line = result(case, made[key])
-        with RESULTS.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        append_line(RESULTS, line)
         print(f"{line['case']}: {line['advised']}, {line['factor']:g} {line['interval']}", flush=True)
     write_page()
 

@@ -16,18 +16,12 @@ from mjx_study.simulation.observation import ObservedState
 from mjx_study.simulation.scene import SceneOption
 
 MODEL: Final = Path(__file__).parents[1] / "models" / "arm.xml"
-GOAL: Final = (0.54, 0.06)
-"""Where the box's centre should come to rest [m]; it starts near (0.42, 0)."""
-LENGTH: Final = 0.1
-"""Distance from the goal that costs 1 [m]."""
-SPEED: Final = 0.2
-"""Final speed that costs 1 [m/s]."""
-SPREAD: Final = (0.01, 0.02)
-"""Half-widths of the uniform distribution of the box's start [m]."""
-TURN: Final = 0.2
-"""Half-width of its heading's [rad]."""
-SCALE: Final = 0.3
-"""Change of a servo's target per unit of the network's output [rad]."""
+GOAL: Final = (0.54, 0.06)  # where the box's centre should come to rest [m]; it starts near (0.42, 0)
+LENGTH: Final = 0.1  # distance from the goal that costs 1 [m]
+SPEED: Final = 0.2  # final speed that costs 1 [m/s]
+SPREAD: Final = (0.01, 0.02)  # half-widths of the uniform distribution of the box's start [m]
+TURN: Final = 0.2  # half-width of its heading's [rad]
+SCALE: Final = 0.3  # change of a servo's target per unit of the network's output [rad]
 HIDDEN: Final = (32, 32)
 COMMAND: Final = (0.0, 0.1, 0.0, -1.0, 0.0, 0.9, 0.0)
 """Output at the start of an optimisation: the hand moves forward and knocks against the box."""
@@ -60,16 +54,8 @@ def push(horizon: int = 160, model: str | Path = MODEL, seed: int = 0, **options
         seen = study.observed(scene, state)
         heading = seen.xmat[box, :2, 0]
         reach, miss = (seen.geom_xpos[knuckle] - seen.xpos[box]) / LENGTH, (seen.xpos[box, :2] - goal) / LENGTH
-        return jnp.concatenate(
-            [
-                reach,
-                miss,
-                heading,
-                state.qvel[7:10],
-                state.qvel[12:] / 5,
-                *((state.qpos[:7] - targets, state.qvel[:7] / 5)),
-            ]
-        )
+        of_box, of_arm = (state.qvel[7:10], state.qvel[12:] / 5), (state.qpos[:7] - targets, state.qvel[:7] / 5)
+        return jnp.concatenate([reach, miss, heading, *of_box, *of_arm])
 
     def running_cost(state: ObservedState, control: Array) -> Array:
         reach = jnp.sum((state.geom_xpos[knuckle] - state.xpos[box]) ** 2) / LENGTH**2

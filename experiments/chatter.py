@@ -16,7 +16,7 @@ import numpy as np
 
 from experiments import DOCS
 from experiments.engines.scenes import SCENES, mjcf, mjcf_state
-from experiments.pages import markdown_row, write_tables
+from experiments.pages import write_tables
 from experiments.quadruped import walk
 from experiments.starts import task_of_start
 from mjx_study.objective import Simulator
@@ -25,11 +25,11 @@ from mjx_study.runtime import configure
 from mjx_study.simulation import onset, touch
 from mjx_study.simulation.contact import ContactModel, family_model
 from mjx_study.simulation.dynamics import State
+from mjx_study.table import markdown_table
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
-SLOTS: Final = 192
-"""Slots for events here, so that all get a term."""
+SLOTS: Final = 192  # slots for events here, so that all get a term
 KINDS: Final = {"none": ("none", 0.0), "all": ("linear", 0.0), "chosen": ("linear", touch.CHATTER)}
 """Terms by name: the kind of onset, and the time between events below which contacts chatter."""
 
@@ -78,7 +78,9 @@ def gradients(task: Task, contact: ContactModel | None, samples: int, chunk: int
         yield name, np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
 
-def row(name: str, task: Task, contact: ContactModel | None, samples: int, chunk: int, pairs: int, reach: float) -> str:
+def row(
+    name: str, task: Task, contact: ContactModel | None, samples: int, chunk: int, pairs: int, reach: float
+) -> list[str]:
     """A row of the table."""
     found = {kind: (each, counts) for kind, each, counts in gradients(task, contact, samples, chunk)}
     mean = found["none"][0].mean(axis=0)
@@ -90,7 +92,7 @@ def row(name: str, task: Task, contact: ContactModel | None, samples: int, chunk
     cells += [", ".join(f"{np.sqrt(each.var(axis=0).sum()):.2g}" for each, _ in found.values())]
     cells += [f"{found['chosen'][1][:, 2].mean():.1f}"]
     print(name, cells, flush=True)
-    return markdown_row(name, *cells)
+    return [name, *cells]
 
 
 def _with_error(samples: np.ndarray) -> str:
@@ -105,13 +107,12 @@ def main() -> None:
     landing = make_task("landing")
     contact = family_model("mujoco_default", landing.scene, effective_mass=landing.effective_mass)
     robot = walk(128)
-    names = "", "slope", "E[FoBG]", "all terms", "chosen", "deviation: none, all, chosen", "events left out"
-    lines = [markdown_row(*names), markdown_row(*["---"] * len(names))]
-    lines += [row(f"box slides, {1e3 * h:g} ms", slide(h), None, 2000, 100, 8000, 0.02) for h in (0.005, 0.002)]
+    lines = [row(f"box slides, {1e3 * h:g} ms", slide(h), None, 2000, 100, 8000, 0.02) for h in (0.005, 0.002)]
     lines += [row("`landing`", landing, contact, 2000, 100, 20_000, 0.02)]
     lines += [row("quadruped", robot, None, 320, 16, 1600, 0.02)]
     lines += [row("quadruped, walking", trained(robot, 120), None, 640, 16, 1600, 0.005)]
-    write_tables(DOCS / "onset-correction.md", {"chatter": "\n".join(lines)})
+    names = "", "slope", "E[FoBG]", "all terms", "chosen", "deviation: none, all, chosen", "events left out"
+    write_tables(DOCS / "onset-correction.md", {"chatter": markdown_table(lines, names)})
 
 
 if __name__ == "__main__":

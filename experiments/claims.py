@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from experiments import DATA, DOCS
+from experiments import DATA, DOCS, write_json
 from experiments.pages import save_figure
 from mjx_study.claims import CLAIMS
 from mjx_study.claims.page import draw_matrix, markdown
@@ -41,8 +41,7 @@ def main() -> None:
     for given in map(Path, sys.argv[1:]):
         found = json.loads(given.read_text())
         path = DATA / ("claims.json" if found["effort"]["name"] == "full" else "claims_quick.json")
-        document = merged(json.loads(path.read_text()), found)
-        path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+        write_json(path, merged(json.loads(path.read_text()), found))
         print(f"written: {path}")
     ledger = json.loads((DATA / "claims.json").read_text())
     (DOCS / "claims.md").write_text(markdown(ledger))

@@ -26,16 +26,13 @@ from mjx_study.table import markdown_table, percent
 PAGE: Final = DOCS / "coverage.md"
 SAMPLES: Final = (10, 400)
 TRIALS: Final = 2000
-TOGETHER: Final = 100
-"""Trials computed together."""
+TOGETHER: Final = 100  # trials computed together
 PARAMS: Final = 3
 DRAWS: Final = 199
 REFERENCE: Final = (100, 0.05)
 """Number of samples of the reference, and its standard error over the gradient's norm."""
-BIAS: Final = 0.3
-"""True relative error: bias over the gradient's norm."""
-SEEDS: Final = 10
-"""Number of batches per estimate of a squared bias."""
+BIAS: Final = 0.3  # true relative error: bias over the gradient's norm
+SEEDS: Final = 10  # number of batches per estimate of a squared bias
 RARE: Final = 0.01
 
 

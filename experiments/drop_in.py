@@ -34,8 +34,7 @@ MODELS: Final = {
 }
 STEPS: Final = 20
 REPEATS: Final = 9
-SETTLING: Final = 0.3
-"""Time before the first state, in which bodies fall to the floor [s]."""
+SETTLING: Final = 0.3  # time before the first state, in which bodies fall to the floor [s]
 
 
 def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarray]:

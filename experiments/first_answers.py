@@ -60,16 +60,7 @@ SESSIONS: Final = {
     "quadruped": ("diagnose quadruped.xml", "diagnose quadruped.xml"),
 }
 MODELS: Final = DATA.parents[1] / "models"
-HEADER: Final = (
-    "command",
-    "wall [s]",
-    "processor [s]",
-    "tracing",
-    "C compiler",
-    "rest",
-    "programs",
-    "load",
-)
+HEADER: Final = ("command", "wall [s]", "processor [s]", "tracing", "C compiler", "rest", "programs", "load")
 HIT: Final = "/jax/compilation_cache/cache_hits"
 
 

@@ -17,8 +17,7 @@ import nbformat
 import optax
 
 NOTEBOOK: Final = Path(__file__).parents[1] / "notebooks" / "7_teach_a_quadruped.ipynb"
-SIGMA: Final = 0.1
-"""Standard deviation of the noise [rad]."""
+SIGMA: Final = 0.1  # standard deviation of the noise [rad]
 
 
 def lesson() -> dict[str, Any]:

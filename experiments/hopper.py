@@ -10,8 +10,7 @@ from jaxtyping import Array, Key
 import mjx_study as study
 from experiments import DATA
 
-BENT = jnp.array([-0.4, 0.8, -0.4])
-"""Angles of hip, knee and ankle in the air [rad]."""
+BENT = jnp.array([-0.4, 0.8, -0.4])  # angles of hip, knee and ankle in the air [rad]
 
 
 def hopper(horizon: int = 100) -> study.Task:

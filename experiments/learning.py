@@ -34,7 +34,7 @@ import mjx_study
 from estimators import Differentiation, Estimator, Evaluation, GradientEstimate, make_estimator, noise
 from estimators.interpolation import apply_choice, constrained_alpha
 from estimators.sampling import draw
-from experiments import DOCS
+from experiments import DOCS, read_lines
 from experiments.figures.rollouts import INK
 from experiments.pages import DPI, write_tables
 from mjx_study.objective.cost import before_each_step, last_of, rollout_cost
@@ -57,27 +57,20 @@ LAW: Final = "hunt_crossley"
 """Contact law through which `fobg_law` learns, at the static stiffness of MuJoCo's default contact; its policies are
 tested in the default contact like all others."""
 TASKS: Final = {"walk": "experiments.quadruped:walk", "hopper": "experiments.hopper:hopper"}
-NETWORKS: Final = {"walk": (), "hopper": (32, 32)}
-"""Hidden widths of the networks that replace the tasks' policies."""
-SAMPLES: Final = 128
-"""Rollouts per iteration, of both orders together."""
+NETWORKS: Final = {"walk": (), "hopper": (32, 32)}  # hidden widths of the networks that replace the tasks' policies
+SAMPLES: Final = 128  # rollouts per iteration, of both orders together
 ITERATIONS: Final = 150
-RATES: Final = (2e-3, 5e-3, 1e-2)
-"""Learning rates of Adam."""
-PIECES: Final = {"walk": 8, "hopper": 4}
-"""Pieces of a rollout."""
+RATES: Final = (2e-3, 5e-3, 1e-2)  # learning rates of Adam
+PIECES: Final = {"walk": 8, "hopper": 4}  # pieces of a rollout
 WINDOWS: Final[dict[str, tuple[int, ...]]] = {"walk": (2, 4, 8), "hopper": (4,)}
 """Pieces between cuts of the adjoint."""
 GAMMAS: Final[dict[str, tuple[float, ...]]] = {"walk": (100.0, 200.0, 400.0), "hopper": (40.0, 80.0, 160.0)}
 """AoBG's bounds: about half, once and twice the radius of the zeroth-order mean at the start."""
 FOOT: Final = {"walk": "front_left_foot", "hopper": "foot"}
 TITLES: Final = {"walk": "quadruped", "hopper": "hopper"}
-SEEDS: Final = 3
-"""Descents of each pair of the grid."""
-LEARN_SEEDS: Final = 12
-"""Descents of the best pair, with other seeds."""
-MOST_NORM: Final = 3.0
-"""Norm to which the gradient of a batch is clipped, for all methods."""
+SEEDS: Final = 3  # descents of each pair of the grid
+LEARN_SEEDS: Final = 12  # descents of the best pair, with other seeds
+MOST_NORM: Final = 3.0  # norm to which the gradient of a batch is clipped, for all methods
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -333,10 +326,8 @@ def best(lines: list[dict[str, Any]], name: str, method: str) -> tuple[float, in
 
 
 HEADINGS: Final = ("method", "rate, window", "cost", "in C: cost", "4 s in C: cost", "distance [m]")
-TICKS: Final = (0.15, 0.2, 0.3, 0.5, 1.0, 2.0)
-"""Of the quadruped's cost, which is positive."""
-HIGHEST: Final = 0.2
-"""Of the hopper's cost in the figure."""
+TICKS: Final = (0.15, 0.2, 0.3, 0.5, 1.0, 2.0)  # of the quadruped's cost, which is positive
+HIGHEST: Final = 0.2  # of the hopper's cost in the figure
 
 
 def figure(lines: list[dict[str, Any]]) -> Figure:
@@ -422,7 +413,7 @@ def _with_interval(values: Float[np.ndarray, " seeds"]) -> str:
 
 def report(path: str) -> None:
     """Write the tables of docs/robots.md and its figure."""
-    lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
+    lines = read_lines(Path(path))
     tables = {name: table(lines, name) for name in TASKS}
     write_tables(DOCS / "robots.md", tables | {f"{name}, grid": grid_table(lines, name) for name in TASKS})
     figure(lines).savefig(DOCS / "learning.png")
@@ -432,8 +423,7 @@ def main(what: str, name: str, method: str, *arguments: str) -> None:
     """Compute one line of the results, and print it."""
     mjx_study.configure()
     if what == "learn":
-        lines = [json.loads(line) for line in Path(arguments[0]).read_text().splitlines()]
-        found = learn(name, method, *best(lines, name, method))
+        found = learn(name, method, *best(read_lines(Path(arguments[0])), name, method))
     else:
         found = {"tune": tune, "spread": spread, "ppo": lambda name, method, *rest: proximal(name, *rest)}[what](
             name, method, *map(json.loads, arguments)

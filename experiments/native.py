@@ -25,7 +25,7 @@ from typing import Any, Final
 import jax
 import numpy as np
 
-from experiments import DATA, DOCS
+from experiments import DATA, DOCS, append_line, read_lines
 from experiments.pages import write_tables
 from experiments.timing import interleaved
 from mjx_study.graph.native import SWITCH, in_numpy
@@ -40,10 +40,8 @@ RESULTS: Final = DATA / "native.jsonl"
 TASKS: Final = ("pusher", "sliding_box", "ball_wall", "momentum_transfer", "tennis", "gripper", "landing")
 KINDS: Final = {"value": "rollouts", "gradient": "gradients", "corrected": "corrected gradients"}
 SAMPLES: Final = {"cpu": 1000, "gpu": 98_304}
-ROUTES: Final = {"native": "1", "NumPy": "0", "XLA": "xla"}
-"""Settings of `SWITCH`."""
-MOST_SECONDS: Final = 300
-"""Maximum time for a route."""
+ROUTES: Final = {"native": "1", "NumPy": "0", "XLA": "xla"}  # settings of `SWITCH`
+MOST_SECONDS: Final = 300  # maximum time for a route
 REPEATS: Final = 7
 
 
@@ -79,7 +77,7 @@ def main() -> None:
     parser.add_argument("tasks", nargs="*", default=TASKS)
     parser.add_argument("--page", action="store_true", help="only write the page")
     parser.add_argument("--route", action="store_true", help="measure one task by the route of this process")
-    parser.add_argument("--into", default=RESULTS, help="file of results")
+    parser.add_argument("--into", type=Path, default=RESULTS, help="file of results")
     given = parser.parse_args()
     if given.route:
         measure(*given.tasks)
@@ -105,14 +103,13 @@ def keep(route: dict[str, Any], command: Sequence[str], switch: str, limit: floa
             lines = (error.stdout or b"").decode().splitlines()
     if lines:
         row = route | json.loads(lines[-1])
-        with open(into, "a") as file:
-            file.write(json.dumps(row) + "\n")
+        append_line(into, row)
         print(row, flush=True)
 
 
 def write_page() -> None:
     """Write the tables of docs/native.md, from the last measurement of each task, route and platform."""
-    rows = {(each["platform"], each["task"], each["route"]): each["found"] for each in map(json.loads, open(RESULTS))}
+    rows = {(each["platform"], each["task"], each["route"]): each["found"] for each in read_lines(RESULTS)}
     tables = {}
     for platform, route in (("cpu", "native"), ("gpu", "native"), ("cpu", "NumPy")):
         lines = []

@@ -3,12 +3,9 @@
 python -m experiments.onset            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
 python -m experiments.onset tennis     # means along four directions of the gains; an hour on one core
 python -m experiments.onset rule       # error of the linear term over the onset strength, 11 contact laws
-python -m experiments.onset wall       # errors where contact is stiff for the timestep; two minutes
 python -m experiments.onset cost       # time of gradients with the linear term over that without; three minutes
 """
 
-import dataclasses
-import itertools
 import sys
 import time
 
@@ -21,18 +18,15 @@ from experiments import DOCS
 from experiments.atlas.design import task_of
 from experiments.pages import markdown_row, write_tables
 from experiments.quadruped import walk
-from experiments.starts import task_of_start
 from experiments.timing import interleaved
 from mjx_study.experiment.quadrature import Line, Means, grid, means
 from mjx_study.experiment.resolution import direction_of
 from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import Simulator
-from mjx_study.results.findings import ERROR_PER_STRENGTH, MOST_STRENGTH
 from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import contact_model, family_model
-from mjx_study.simulation.dynamics import State
-from mjx_study.table import percent
+from mjx_study.table import markdown_table, percent
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
@@ -50,11 +44,6 @@ LAWS = (
     ((0.02, 1.0), (0.5, 0.95)),
 )
 """solref, and the impedances at the surface and at full width; they differ over 1 mm."""
-WALL = """<mujoco><option timestep="{timestep}" gravity="0 0 0"/>
-  <default><geom solref="0.02 {ratio}" friction="0.5 0 0"/></default>
-  <worldbody><geom type="plane" size="20 20 1" pos="0.4 0 0" zaxis="-1 0 0"/>
-  <body><freejoint/><geom type="sphere" size="0.1" mass="1"/></body></worldbody></mujoco>"""
-RATIOS, TIMESTEPS_AT_WALL = (1.0, 0.215), (0.005, 0.002, 0.001)
 RULED = (
     ("momentum_transfer", 0.001, ANGLES["momentum_transfer"]),
     ("momentum_transfer", 0.002, ANGLES["momentum_transfer"]),
@@ -134,48 +123,6 @@ def rule() -> None:
     print(f"{len(cases)} cases: {min(cases):.2g} to {max(cases):.2g}, median {np.median(cases):.2g}")
 
 
-def wall_task(timestep: float, ratio: float) -> Task:
-    """Return a sphere that meets a wall 0.3 m ahead at 1 m/s, without gravity; its last position is the cost."""
-
-    def start_at(start: State, parameters: jax.Array) -> State:
-        return dataclasses.replace(start, qvel=start.qvel.at[0].set(parameters[0]))
-
-    mjcf, horizon = WALL.format(timestep=timestep, ratio=ratio), round(0.5 / timestep)
-    return task_of_start("wall", mjcf, horizon, start_at, 1.0, 0.1, lambda state: state.qpos[0])
-
-
-def wall() -> None:
-    """Write errors of the term at a wall, over the stiffness of the contact for the timestep."""
-    names = "contact", "h b", "h √(k d)", "slope", "E[FoBG]", "linear", "jump"
-    rows = [markdown_row(*names, "linear: error, of what it adds", "told: at most")]
-    rows += [markdown_row(*["---"] * 9)]
-    for ratio, timestep in itertools.product(RATIOS, TIMESTEPS_AT_WALL):
-        task, center = wall_task(timestep, ratio), np.ones(1)
-        points = grid(1.0, 1.0, task.sigma, POINTS, task.noise)
-        plain, linear, jump = (
-            means(points, *Line(task.replace(onset=onset))(points, None), center, task.sigma, task.noise)
-            for onset in TREATMENTS
-        )
-        keys = jax.random.split(jax.random.key(0), 512)
-        events = Simulator(task, CHUNK).objective(None).differentiate_corrected(task.theta, keys).events
-        strength = dict(zip(ONSETS, onset_numbers(np.asarray(events)), strict=True))["onset_strength"]
-        share = abs(linear.first - linear.slope)[0] / abs(linear.first - plain.first)[0]
-        damping, stiffness = 2 / (0.95 * 0.02), 0.9 / (0.95 * 0.02 * ratio) ** 2
-        numbers = plain.slope, plain.first, linear.first, jump.first
-        rows.append(
-            markdown_row(
-                f"damping ratio {ratio:g}, {1e3 * timestep:g} ms",
-                f"{timestep * damping:.2f}",
-                f"{timestep * stiffness**0.5:.2f}",
-                *(f"{each[0]:.3f}" for each in numbers),
-                percent(share, 2),
-                "more than it adds" if strength > MOST_STRENGTH else percent(ERROR_PER_STRENGTH * strength, 2),
-            )
-        )
-        print(rows[-1], linear.first_error, linear.slope_error, flush=True)
-    write_tables(DOCS / "onset-correction.md", {"wall": "\n".join(rows)})
-
-
 def cost() -> None:
     """Write the ratios of gradients' times, and what the rollouts' events are, in processor time of one device."""
     tasks = {f"`{name}`": (make_task(name), SAMPLES_AT_ONCE) for name in TIMED} | {"quadruped": (walk(128), 16)}
@@ -196,17 +143,15 @@ def cost() -> None:
         ratios.append(f"{np.median(taken['term']) / np.median(taken['plain']):.2f}")
         events.append(f"{np.mean(found):.1f}, {np.max(found):.0f}, {np.mean(missed):.1f}")
         print(ratios, events, flush=True)
-    rows = markdown_row("", *tasks), markdown_row(*["---"] * (1 + len(tasks)))
-    named = ("time with the term over time without", ratios), ("onsets: mean, most, without a term", events)
-    table = [*rows, *(markdown_row(name, *cells) for name, cells in named)]
-    write_tables(DOCS / "onset-correction.md", {"cost": "\n".join(table)})
+    rows = ("time with the term over time without", *ratios), ("onsets: mean, most, without a term", *events)
+    write_tables(DOCS / "onset-correction.md", {"cost": markdown_table(rows, ("", *tasks))})
 
 
 def main() -> None:
     """Run the command line."""
     configure(cpu_devices=1)
     if chosen := sys.argv[1:]:
-        {"tennis": tennis, "rule": rule, "wall": wall, "cost": cost}[chosen[0]]()
+        {"tennis": tennis, "rule": rule, "cost": cost}[chosen[0]]()
         return
     for name, angles in ANGLES.items():
         found = {onset: measure(make_task(name).replace(onset=onset), angles) for onset in TREATMENTS}

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import DOCS
-from experiments.pages import markdown_row, write_tables
+from experiments.pages import write_tables
 from mjx_study.experiment.quadrature import grid
 from mjx_study.objective import rollout_cost
 from mjx_study.runtime import configure
@@ -77,13 +77,14 @@ def main() -> None:
     """Write the table."""
     configure(cpu_devices=1)
     found = {"slope": slopes()} | {onset: mean_gradients(onset) for onset in ("none", "linear", "jump")}
-    table = [markdown_table([], ("parameter", "slope", "E[FoBG]", "linear", "jump", "linear, jump: off by"))]
+    rows = []
     for name in REACHES:
         every = [means[name] for means in found.values()]
         (slope, _), *terms = every[0], every[2][0], every[3][0]
         cells = [f"{fine:.4f} ± {abs(fine - coarse):.1g}" for fine, coarse in every]
-        table.append(markdown_row(name, *cells, ", ".join(percent(abs(each / slope - 1), 2) for each in terms)))
-    write_tables(DOCS / "onset-correction.md", {"model": "\n".join(table)})
+        rows.append([name, *cells, ", ".join(percent(abs(each / slope - 1), 2) for each in terms)])
+    header = ("parameter", "slope", "E[FoBG]", "linear", "jump", "linear, jump: off by")
+    write_tables(DOCS / "onset-correction.md", {"model": markdown_table(rows, header)})
 
 
 if __name__ == "__main__":

@@ -25,10 +25,8 @@ from mjx_study.tasks.network import Network
 from mjx_study.tasks.task import Task
 
 ENVIRONMENTS: Final = 1024
-STEPS: Final = 32
-"""Steps of every environment between updates."""
-MOST_ACTION: Final = 10.0
-"""Bound that the library needs on the network's outputs, ten times those met."""
+STEPS: Final = 32  # steps of every environment between updates
+MOST_ACTION: Final = 10.0  # bound that the library needs on the network's outputs, ten times those met
 
 
 class Environments(VecEnv):

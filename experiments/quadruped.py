@@ -17,12 +17,9 @@ from mjx_study.tasks.network import Network
 
 MODEL: Final = Path(__file__).parents[1] / "models" / "quadruped.xml"
 FEET: Final = tuple(f"{end}_{side}_foot" for end in ("front", "hind") for side in ("left", "right"))
-PACE: Final = 0.5
-"""Speed to walk at [m/s]."""
-HEIGHT: Final = 0.3
-"""Height of the trunk to keep [m]."""
-SCALE: Final = 0.3
-"""Change of a servo's target per unit of the network's output [rad]."""
+PACE: Final = 0.5  # speed to walk at [m/s]
+HEIGHT: Final = 0.3  # height of the trunk to keep [m]
+SCALE: Final = 0.3  # change of a servo's target per unit of the network's output [rad]
 HIDDEN: Final = (64, 32)
 
 

@@ -27,18 +27,18 @@ import mujoco.rollout
 import numpy as np
 
 import mjx_study
-from experiments import DATA, DOCS, ROOT
+from experiments import DATA, DOCS, ROOT, read_lines
 from experiments.drop_in import STEPS, TESTED, prepared, start_states
 from experiments.native import keep, number
 from experiments.pages import write_tables
 from experiments.timing import interleaved
 from mjx_study.bench import gradient_of_engine
-from mjx_study.graph.function import ScalarFunction
 from mjx_study.graph.linear_map import implicit_derivative
 from mjx_study.graph.scalars import captured_once
 from mjx_study.runtime import PRECISIONS, available_cores
 from mjx_study.simulation import native_step
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.dynamics import equations
 from mjx_study.simulation.linear_algebra import solve_positive_definite
 from mjx_study.table import markdown_table
 
@@ -59,11 +59,9 @@ COLUMNS: Final = {
     ("engine", "rollouts"): ("C engine", "rollouts"),
     ("engine", "gradients"): ("C engine", "gradients by differences"),
 }
-BUDGET: Final = (100, 50)
-"""Iterations of the solver and of its line search."""
+BUDGET: Final = (100, 50)  # iterations of the solver and of its line search
 SAMPLES: Final = {"cpu": 256, "gpu": 16_384}
-MOST_SECONDS: Final = 900
-"""Maximum time for a route."""
+MOST_SECONDS: Final = 900  # maximum time for a route
 REPEATS: Final = 7
 
 
@@ -119,28 +117,21 @@ def differences_by_engine(host: mujoco.MjModel) -> partial[Any]:
     return partial(gradient_of_engine, host, (qpos[0], qvel[0]), np.tile(standing(host), (STEPS, 1)))
 
 
-def solved_step(model: mjx.Model, data: mjx.Data) -> tuple[ScalarFunction, native_step.Layout]:
-    """The graph of a step."""
-    leaves, structure = jax.tree.flatten(data)
-    kinds = tuple(jax.ShapeDtypeStruct(np.shape(leaf), jax.typeof(leaf).dtype) for leaf in leaves)
-    solved = captured_once(native_step._solved, model, structure.unflatten(kinds))
-    assert solved is not None
-    return solved, (structure, kinds, tuple(solved.used))
-
-
 def sizes(name: str) -> dict[str, int]:
     """Degrees of freedom, constraint rows, and scalar operations of a robot's step and its transposed derivative."""
     host = loaded(ROBOTS[name])
     model, data = mjx.put_model(host), mjx.make_data(host)
     rows: Any = data._impl
     names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(data)]
-    solved, layout = solved_step(model, data)
+    found = native_step.solved_graph(model, data)
+    assert found is not None
+    solved, layout = found
     _, kinds, used = layout
-    equations = partial(native_step._equations, layout)
+    left_sides = partial(equations, partial(native_step._forced, layout))
     qacc = jax.ShapeDtypeStruct((host.nv,), float)
-    captured = captured_once(equations, model, *(kinds[place] for place in used), qacc)
+    captured = captured_once(left_sides, model, *(kinds[place] for place in used), qacc)
     assert captured is not None
-    moving = tuple(at for at, place in enumerate(used) if names[place] in native_step._MOVING)
+    moving = tuple(at for at, place in enumerate(used) if names[place] in native_step.MOVING)
     slope = implicit_derivative(captured, moving, solve_positive_definite)
     return {
         "DoF": host.nv,
@@ -160,7 +151,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, help="rollouts at once, in place of the tables'")
     parser.add_argument("--precision", default="float64", choices=PRECISIONS)
     parser.add_argument("--here", action="store_true", help="measure one robot by one route in this process")
-    parser.add_argument("--into", default=RESULTS, help="file of results")
+    parser.add_argument("--into", type=Path, default=RESULTS, help="file of results")
     given = parser.parse_args()
     if given.here:
         measure(given.robots[0], given.routes[0], given.samples, given.precision)
@@ -175,7 +166,7 @@ def main() -> None:
 
 def results() -> dict[tuple[Any, ...], dict[str, Any]]:
     """The last measurement of each platform, robot, route, number of samples and precision."""
-    names, rows = ("platform", "robot", "route", "samples"), map(json.loads, open(RESULTS))
+    names, rows = ("platform", "robot", "route", "samples"), read_lines(RESULTS)
     return {(*(row[name] for name in names), row.get("precision", "float64")): row["found"] for row in rows}
 
 

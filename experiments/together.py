@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import DATA, DOCS
-from experiments.pages import markdown_row, write_tables
+from experiments import DATA, DOCS, read_lines
+from experiments.pages import write_tables
 from experiments.starts import task_of_start
 from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.runtime import configure
 from mjx_study.simulation.corners import SKIN
 from mjx_study.simulation.dynamics import State, initial_state, rollout
-from mjx_study.table import percent
+from mjx_study.table import markdown_table, percent
 from mjx_study.tasks.task import Task
 
 RESULTS: Final = DATA / "together.jsonl"
@@ -202,21 +202,20 @@ def intervals() -> None:
 
 def read() -> dict[str, dict[str, Any]]:
     """Return the results so far."""
-    lines = map(json.loads, RESULTS.read_text().splitlines()) if RESULTS.exists() else ()
-    return {line.pop("case"): line for line in lines}
+    return {line.pop("case"): line for line in read_lines(RESULTS)}
 
 
 def page(results: dict[str, dict[str, Any]]) -> None:
     """Write the table: errors as shares of the slope, and the quadrature's."""
-    rows = [markdown_row("case", "timestep", "slope", *(f"off by: {name}" for name in ("plain", "linear", "jump")))]
-    rows.append(markdown_row(*["---"] * 6))
+    rows = []
     for name, each in results.items():
         slope, unsure = each["slope"]
         errors = ((abs(each[onset][0] / slope - 1), (each[onset][1] + unsure) / abs(slope)) for onset in TREATMENTS)
         off = [" ± ".join(percent(part, 1) for part in pair) for pair in errors]
         what, timestep = name.rsplit(", ", 1)
-        rows.append(markdown_row(what, timestep, f"{slope:.4g} ± {unsure:.1g}", *off))
-    write_tables(DOCS / "onset-correction.md", {"together": "\n".join(rows)})
+        rows.append((what, timestep, f"{slope:.4g} ± {unsure:.1g}", *off))
+    header = "case", "timestep", "slope", *(f"off by: {name}" for name in ("plain", "linear", "jump"))
+    write_tables(DOCS / "onset-correction.md", {"together": markdown_table(rows, header)})
 
 
 def main() -> None:

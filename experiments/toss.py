@@ -73,10 +73,7 @@ def main() -> None:
     for pulls, timestep in itertools.product((True, False), (0.1, 0.001)):
         found = means(points, *point(points, timestep, pulls=pulls), np.array([START]), SPREAD, "gaussian")
         what = "as published" if pulls else "without its pull"
-        numbers = (
-            _with_error(found.slope, found.slope_error),
-            _with_error(found.first, found.first_error),
-        )
+        numbers = (_with_error(found.slope, found.slope_error), _with_error(found.first, found.first_error))
         print(markdown_row(f"point, {what}, h = {1e3 * timestep:g} ms", *numbers, ""))
     points = grid(SPEED, SPEED, SIGMA, POINTS, "gaussian")
     for geom in GEOMS:
@@ -86,10 +83,7 @@ def main() -> None:
             plain, corrected = (
                 means(points, *line(points, contact), np.array([SPEED]), SIGMA, "gaussian") for line in lines
             )
-            numbers = [
-                _with_error(plain.slope, plain.slope_error),
-                _with_error(plain.first, plain.first_error),
-            ]
+            numbers = [_with_error(plain.slope, plain.slope_error), _with_error(plain.first, plain.first_error)]
             numbers.append(_with_error(corrected.first, corrected.first_error))
             print(markdown_row(f"{geom}, solimp[0] = {name}", *numbers), flush=True)
 

@@ -11,7 +11,6 @@ later steps, and so which contacts chatter.
 
 import copy
 import dataclasses
-import json
 import sys
 from typing import Any, Final
 from unittest import mock
@@ -23,7 +22,7 @@ from jaxtyping import Array, Float, Key
 
 import mjx_study
 from estimators import zeroth_order
-from experiments import DATA, DOCS
+from experiments import DATA, DOCS, append_line, read_lines
 from experiments.pages import write_tables
 from experiments.wild import CONVERGED, MEAN_STEPS, REACH, SIGMA, environment
 from mjx_study.objective import Simulator
@@ -40,10 +39,8 @@ CASES: Final = (
 )
 """Environments, numbers of their steps, and parts into which each timestep of their simulation is divided."""
 SAMPLES: Final = 2000
-PAIRS: Final = 8000
-"""Pairs of rollouts behind a slope."""
-STARTS: Final = 4096
-"""Initial states to draw from."""
+PAIRS: Final = 8000  # pairs of rollouts behind a slope
+STARTS: Final = 4096  # initial states to draw from
 RESULTS: Final = DATA / "tumble.jsonl"
 
 
@@ -138,7 +135,7 @@ def _mean(samples: np.ndarray) -> list[float]:
 def table() -> str:
     """The page's table, from the stored results."""
     lines = []
-    for each in map(json.loads, RESULTS.read_text().splitlines()):
+    for each in read_lines(RESULTS):
         kinds = [each[kind] for kind in ("zobg", "fobg", "fobg_onset")]
         means = [with_error(*mean) for mean in (each["slope"], *(kind["mean"] for kind in kinds))]
         deviations = [number(kind["deviation"]) for kind in kinds]
@@ -155,8 +152,7 @@ def main() -> None:
         mjx_study.configure()
         RESULTS.write_text("")
         for case in CASES:
-            with RESULTS.open("a") as file:
-                print(json.dumps(measured(*case)), file=file)
+            append_line(RESULTS, measured(*case))
     write_tables(DOCS / "in-the-wild.md", {"tumble": table()})
 
 

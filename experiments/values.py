@@ -9,7 +9,6 @@ its steps. Half a minute per model, most of it XLA compiling stock MJX.
 """
 
 import argparse
-import json
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 from mujoco.mjx._src import math as mjx_math
 
 import mjx_study
-from experiments import DATA, DOCS, ROOT
+from experiments import DATA, DOCS, ROOT, append_line, read_lines
 from experiments.drop_in import TESTED
 from experiments.pages import write_tables
 from experiments.robots import ROBOTS, loaded
@@ -34,11 +33,9 @@ from mjx_study.table import markdown_table
 RESULTS: Final = DATA / "values.jsonl"
 SAMPLES: Final = 16
 PATH: Final = 100
-LATEST: Final = 400
-"""Steps of the C engine before a state, at most."""
+LATEST: Final = 400  # steps of the C engine before a state, at most
 INPUTS: Final = "qpos", "qvel", "act", "ctrl"
-DIFFERENCES: Final = 1e-5, 1e-6, 1e-7
-"""Steps of central differences, the best of which counts."""
+DIFFERENCES: Final = 1e-5, 1e-6, 1e-7  # steps of central differences, the best of which counts
 LEFT_OUT: Final = {*(f"humanoid/{count:02}_humanoids" for count in range(2, 11)), "ray", "actuator/general_dyntype"}
 """Copies of a body, a model without a coordinate, and one with a singular inertia matrix."""
 MODELS: Final[dict[str, Path]] = {
@@ -50,8 +47,7 @@ MODELS: Final[dict[str, Path]] = {
         if (name := str(path.relative_to(TESTED).with_suffix(""))) not in LEFT_OUT and path not in ROBOTS.values()
     },
 }
-EDGES: Final = "barkour_v0, exact edges"
-"""That model with the closest points of edges computed without MJX's 1e-6."""
+EDGES: Final = "barkour_v0, exact edges"  # that model with the closest points of edges computed without MJX's 1e-6
 PAIRS: Final = "ours - stock", "ours - engine", "stock - engine"
 HEADINGS: Final = (
     *("model", "DoF", "native - stock", "native - C", "stock - C"),
@@ -194,15 +190,14 @@ def main() -> None:
     mjx_study.configure()
     for name in () if given.page else given.models:
         found = {"model": name} | compared(name)
-        with open(RESULTS, "a") as file:
-            file.write(json.dumps(found) + "\n")
+        append_line(RESULTS, found)
         print(found, flush=True)
     write_page()
 
 
 def write_page() -> None:
     """Write the table of docs/robots.md, from the last comparison of each model; tendons in one row."""
-    found = {each["model"]: each for each in map(json.loads, open(RESULTS)) if "left" not in each}
+    found = {each["model"]: each for each in read_lines(RESULTS) if "left" not in each}
     groups = {f"`{name}`": [each] for name, each in found.items() if not name.startswith("tendon/")}
     tendons = [each for name, each in found.items() if name.startswith("tendon/")]
     groups[f"`tendon/*`, {len(tendons)} models"] = tendons

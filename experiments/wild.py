@@ -29,16 +29,11 @@ from estimators import Differentiation, Evaluation, FirstOrder, circulation
 from mjx_study import differentiable_mjx
 from mjx_study.table import markdown_table
 
-STEPS: Final = 100
-"""Steps of a single rollout."""
-MEAN_STEPS: Final = 50
-"""Steps of each rollout of a mean."""
-SIGMA: Final = 0.1
-"""Standard deviation of the noise on actions, for means."""
-SIZES: Final = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-"""Steps of finite differences, in the unit of the action."""
-REACH: Final = 0.05
-"""Half the length of the path of integration, in the unit of the action."""
+STEPS: Final = 100  # steps of a single rollout
+MEAN_STEPS: Final = 50  # steps of each rollout of a mean
+SIGMA: Final = 0.1  # standard deviation of the noise on actions, for means
+SIZES: Final = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # steps of finite differences, in the unit of the action
+REACH: Final = 0.05  # half the length of the path of integration, in the unit of the action
 NODES: Final = 3
 BATCH: Final = 100
 CONFIDENCE: Final = 0.99

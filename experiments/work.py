@@ -21,21 +21,20 @@ from experiments import DOCS
 from experiments.drop_in import start_states
 from experiments.native import number
 from experiments.pages import write_tables
-from experiments.robots import ROBOTS, SAMPLES, loaded, results, solved_step, standing
+from experiments.robots import ROBOTS, SAMPLES, loaded, results, standing
 from mjx_study.graph import numpy_code
 from mjx_study.graph.c import Writer
 from mjx_study.graph.native import SWITCH
 from mjx_study.graph.parts import Loop, Statement
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.native_step import solved_graph
 from mjx_study.table import markdown_table
 
 STATES: Final = 256
-REGISTERS: Final = 255 // 2
-"""Of 64 bits, that a thread of an H100 has."""
+REGISTERS: Final = 255 // 2  # of 64 bits, that a thread of an H100 has
 OPERATIONS: Final = 34e12 / 2
 """Operations in float64 per second of an H100 (SXM), a fused multiplication and addition as one [data sheet]."""
-BANDWIDTH: Final = 3.35e12
-"""Bytes per second of an H100's memory [data sheet]."""
+BANDWIDTH: Final = 3.35e12  # bytes per second of an H100's memory [data sheet]
 
 
 def passes_of(name: str) -> dict[str, float]:
@@ -128,7 +127,9 @@ def moved(steps: list[tuple[Statement, float]], inputs: Iterable[int]) -> float:
 def work(name: str) -> tuple[float, float]:
     """Operations, and bytes loaded and stored, of a sample's step."""
     host = loaded(ROBOTS[name])
-    solved, (*_, used) = solved_step(mjx.put_model(host), mjx.make_data(host))
+    found = solved_graph(mjx.put_model(host), mjx.make_data(host))
+    assert found is not None
+    solved, (*_, used) = found
     writer = Writer(solved.of(used))
     items, *_ = writer.written(None)
     steps = list(in_order(items, passes_of(name)))

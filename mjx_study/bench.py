@@ -265,7 +265,8 @@ def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:
     states, controls, *_ = jax.jit(lambda theta, contact: simulate(task, theta, contact, key, 1.0))(task.theta, contact)
     start = (np.asarray(states.qpos[0], float), np.asarray(states.qvel[0], float))
     played = np.asarray(controls, float)
-    times = [_seconds(lambda: engine_gradient(task, contact, start, played)) for _ in range(ENGINE_SAMPLES)]
+    gradient = lambda: gradient_of_engine(engine_model(task.scene, contact), start, played)  # noqa: E731
+    times = [_seconds(gradient) for _ in range(ENGINE_SAMPLES)]
     return statistics.median(times)
 
 
@@ -290,18 +291,11 @@ def engine_rollouts(
     return len(keys), lambda: rollout.rollout(host, data, starts, played, nstep=task.horizon, persistent_pool=True)[0]
 
 
-def engine_gradient(
-    task: Task, contact: ContactModel | None, start: tuple[np.ndarray, np.ndarray], controls: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient of the final state's sum over initial state and controls, by centred differences of each of the C
-    engine's steps and one adjoint sweep."""
-    return gradient_of_engine(engine_model(task.scene, contact), start, controls)
-
-
 def gradient_of_engine(
     host: mujoco.MjModel, start: tuple[np.ndarray, np.ndarray], controls: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`engine_gradient` of a model."""
+    """Gradient of the final state's sum over initial state and controls, by centred differences of each of the C
+    engine's steps and one adjoint sweep."""
     data = mujoco.MjData(host)
     data.qpos[:], data.qvel[:] = start
     size = 2 * host.nv + host.na

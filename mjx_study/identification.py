@@ -27,8 +27,7 @@ Predict = Callable[[dict[str, Any]], Any]
 Numbers = np.ndarray | Array | float
 
 DERIVATIVES: Final = ("exact", "smoothed", "none")
-SPREAD: Final = 0.02
-"""Standard deviation of the logarithms by which predictions are smoothed."""
+SPREAD: Final = 0.02  # standard deviation of the logarithms by which predictions are smoothed
 _SLIDES_ONLY: Final = 2
 """MuJoCo's mark of bodies on slides along axes alone, whose inverse weight is that of their mass alone."""
 DECREMENT: Final = 1e-3

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.study import drawings_of, plot_study
 from mjx_study.results.kind import Drawing, findings_of, kind_of
-from mjx_study.results.numbers import meanings_of, numbers_of, shown
+from mjx_study.results.rows import meanings_of, numbers_of, shown
 from mjx_study.results.warnings import warnings_of
 from mjx_study.table import plural
 
@@ -49,7 +49,11 @@ class StudyAccessor:
 
 @np.errstate(over="ignore", invalid="ignore")  # numbers of a motion that explodes
 def render_report(dataset: xr.Dataset) -> str:
-    config, kind, drawings = json.loads(dataset.attrs["config"]), kind_of(dataset), drawings_of(dataset)
+    config, environment = (json.loads(dataset.attrs[name]) for name in ("config", "environment"))
+    kind, drawings = kind_of(dataset), drawings_of(dataset)
+    versions = environment.pop("versions")
+    revision = {"revision": dataset.attrs["revision"]} if "revision" in dataset.attrs else {}
+    provenance = environment | versions | revision
     pages = jinja2.Environment(loader=jinja2.PackageLoader("mjx_study"), autoescape=True, keep_trailing_newline=True)
     return pages.get_template("report.html").render(
         tasks=", ".join(config["tasks"]),
@@ -62,7 +66,7 @@ def render_report(dataset: xr.Dataset) -> str:
         numbers=numbers_of(dataset),
         meanings=meanings_of(dataset),
         config=[[key, shown(value)] for key, value in sorted(config.items()) if value not in (None, [], "")],
-        provenance=_provenance(dataset),
+        provenance=[[name, shown(value)] for name, value in provenance.items()],
         command=dataset.attrs.get("command"),
     )
 
@@ -81,12 +85,3 @@ def _summary(dataset: xr.Dataset) -> str:
     return (
         f"{seed}; {plural(samples, 'sample')} in a batch; ± one standard error; -: not defined, or explained by noise."
     )
-
-
-def _provenance(dataset: xr.Dataset) -> list[list[str]]:
-    environment = json.loads(dataset.attrs["environment"])
-    versions = environment.pop("versions")
-    found = environment | versions
-    if "revision" in dataset.attrs:
-        found["revision"] = dataset.attrs["revision"]
-    return [[name, shown(value)] for name, value in found.items()]

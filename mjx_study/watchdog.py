@@ -9,7 +9,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
+from functools import partial
 from typing import Final
 
 import jax
@@ -36,14 +37,10 @@ def _marked(marks: list[int]) -> Generator[None]:
         marks.pop()
 
 
-def awaited() -> AbstractContextManager[None]:
-    """Mark that a thread waits for computation of this process."""
-    return _marked(_AWAITED)
-
-
-def elsewhere() -> AbstractContextManager[None]:
-    """Mark that another process, such as a compiler, works for this one."""
-    return _marked(_ELSEWHERE)
+awaited = partial(_marked, _AWAITED)
+"""Mark that a thread waits for computation of this process."""
+elsewhere = partial(_marked, _ELSEWHERE)
+"""Mark that another process, such as a compiler, works for this one."""
 
 
 def watch(complain: Callable[[str], None], seconds: int = SECONDS, tick: float = 1.0) -> None:

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import pkgutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import jax
 import psutil
 import pytest
+from jaxtyping import install_import_hook
 
 # Compilation is most of a test's time, and rounding does not matter: no optimisation, and XLA's plain emitters, which
 # compile twice as fast as those of fusions. Subprocesses inherit it. XLA reads it when the first array is made, and
@@ -37,6 +39,18 @@ jax.config.update("jax_num_cpu_devices", 1)
 jax.config.update("jax_cpu_enable_async_dispatch", False)
 for name, value in SETTINGS.items():
     jax.config.update(name, value)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--no-types", action="store_true", help="do not check types and array shapes at run time")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Check types and array shapes in both packages, but for graphs, whose functions are called for every scalar."""
+    if not config.getoption("--no-types"):
+        modules = pkgutil.iter_modules([str(Path(__file__).parents[1] / "mjx_study")])
+        checked = [f"mjx_study.{module.name}" for module in modules if module.name != "graph"]
+        install_import_hook(["estimators", *checked], "beartype.beartype")
 
 
 @pytest.fixture(scope="module", autouse=True)

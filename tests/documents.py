@@ -11,9 +11,8 @@ import pytest
 import xarray as xr
 
 from mjx_study.execution.cells import Cells, compute_here
-from mjx_study.experiment.checkpoint import Checkpoint
 from mjx_study.experiment.gradients import Gradients
-from mjx_study.experiment.study import Computation, StudyCell, StudyPlan, done
+from mjx_study.experiment.study import Checkpoint, Computation, StudyCell, StudyPlan, done
 from mjx_study.progress import silent
 from mjx_study.results.kind import find_kind
 from mjx_study.results.variables import MEASURED

@@ -17,7 +17,7 @@ from typing import Any, Final
 import pytest
 
 from mjx_study.disk import write_whole
-from mjx_study.storage import cell_files
+from mjx_study.storage import arrays as cell_files
 
 CALLS: Final = ("open", "mkdir", "fsync", "fchmod", "replace")
 """Functions of `os` that change the disk; writes to open files count as well."""

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from estimators.merged_samples import moments_of
-from mjx_study.experiment.checkpoint import Checkpoint, StudyError
 from mjx_study.experiment.merged_samples import Blocks, pack
+from mjx_study.experiment.study import Checkpoint, StudyError
 from mjx_study.experiment.tally import Tally
 from mjx_study.storage import arrays as module
 from mjx_study.storage.arrays import read_arrays, write_arrays

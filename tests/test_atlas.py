@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from estimators.confidence import coverage_interval
-from experiments import DOCS
+from experiments import DOCS, read_lines
 from experiments.atlas import design, jumps, page, run, table
 from experiments.pages import replace_tables
 from mjx_study.table import percent
@@ -248,7 +248,7 @@ def test_the_file_holds_every_cell_of_the_laws() -> None:
     for name in ("program", "family", "stiffness", "smoothing", "sigma", "theta"):
         expected = [getattr(cells[index], name) for index in OF_LAWS["index"]]
         np.testing.assert_allclose(OF_LAWS[name], expected, rtol=2**-run.DIGITS)
-    assert set(jumps.judged(OF_LAWS)["index"]) == {each["index"] for each in jumps.load()}
+    assert set(jumps.judged(OF_LAWS)["index"]) == {each["index"] for each in read_lines(jumps.JUMPS)}
 
 
 def test_cells_of_laws_follow_with_numbers_of_their_own() -> None:

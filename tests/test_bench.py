@@ -63,7 +63,7 @@ def test_the_engines_rival_computes_a_gradient() -> None:
     task = make_task("pusher", horizon=20)
     (cell,), _ = family_grid(task, ["mujoco"], [100.0])
     start, controls = (np.array([0.0, 1.0]), np.zeros(2)), np.full((20, 1), 0.1)
-    over_start, over_controls = bench.engine_gradient(task, cell.contact, start, controls)
+    over_start, over_controls = bench.gradient_of_engine(bench.engine_model(task.scene, cell.contact), start, controls)
 
     def last(speed: float, controls: np.ndarray) -> float:
         host = engine_model(task.scene, cell.contact)

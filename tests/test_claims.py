@@ -14,7 +14,7 @@ from experiments.claims import merged
 from mjx_study import cli
 from mjx_study.choices import laws_of
 from mjx_study.claims import CLAIMS, NUM_VERDICTS, ledger
-from mjx_study.claims.claim import Claim, Criterion, above, below
+from mjx_study.claims.claim import Claim, Criterion
 from mjx_study.claims.laboratory import EFFORTS, FAMILIES, Laboratory, Statistic, exact, mean_of, ratio_of, share_of
 from mjx_study.claims.ledger import deciding_size, interval_of, measure_ledger
 from mjx_study.claims.page import markdown, matrix_lines, verdict_counts
@@ -40,9 +40,12 @@ def planted(mean: float, count: int = 400) -> Statistic:
 @pytest.mark.parametrize(
     ("criterion", "verdicts"),
     [  # intervals have a half width of 0.19
-        (above("x", 0.5, -0.5), {1.0: "holds", 0.6: "undecided", 0.0: "fails", -0.6: "fails", -1.0: "reversed"}),
-        (above("x", 0.5), {-1.0: "fails"}),
-        (below("x", 0.5, 0.7), {0.0: "holds", 0.95: "reversed"}),
+        (
+            Criterion("x", (0.5, math.inf), (-math.inf, -0.5)),
+            {1.0: "holds", 0.6: "undecided", 0.0: "fails", -0.6: "fails", -1.0: "reversed"},
+        ),
+        (Criterion("x", (0.5, math.inf)), {-1.0: "fails"}),
+        (Criterion("x", (-math.inf, 0.5), (0.7, math.inf)), {0.0: "holds", 0.95: "reversed"}),
         (Criterion("x", (-0.3, 0.3)), {0.0: "holds", 0.2: "undecided", 0.6: "fails"}),
         (Criterion("x", (-0.1, 0.1)), {0.0: "undecided", math.inf: "undecided"}),
     ],
@@ -69,7 +72,7 @@ def test_intervals() -> None:
 
 def test_the_sample_size_that_would_decide() -> None:
     """An interval about the same estimate decides from that size on, and not before."""
-    criterion, few = above("x", 0.5), planted(0.6)
+    criterion, few = Criterion("x", (0.5, math.inf)), planted(0.6)
     size = deciding_size(few, criterion, LEVEL)
     assert size is not None and 1200 < size < 1600
     assert criterion.verdict(interval_of(planted(0.6, size + 20), LEVEL)) == "holds"
@@ -168,7 +171,7 @@ def test_a_stopped_run_resumes_and_changed_claims_are_measured_again(tmp_path: P
         return exact(value)
 
     def claim(name: str, systems: str, bound: float = 0.0, quantity: str = "x", **options: float) -> Claim:
-        criterion, chosen = above(quantity, bound), dict.fromkeys(systems, ("reference",))
+        criterion, chosen = Criterion(quantity, (bound, math.inf)), dict.fromkeys(systems, ("reference",))
         return Claim(name, "", "", criterion, chosen, measure, options=options)
 
     def again(*claims: Claim, effort: str = "quick", accept: bool = False) -> tuple[str, str]:

@@ -28,7 +28,7 @@ from mjx_study import cli
 from mjx_study.execution import cluster
 from mjx_study.execution.cluster import TRIES
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.study import StudyError
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.folder import Store, load_study

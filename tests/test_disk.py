@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, temporary_name, write_whole
-from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.study import StudyError
 from mjx_study.storage.dataset import write_dataset
 from mjx_study.storage.folder import Store
 from tests.documents import cell_arrays, study_document

@@ -18,8 +18,8 @@ from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import STYLES, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report
 from mjx_study.results.kind import find_kind
-from mjx_study.results.numbers import meanings_of
-from mjx_study.results.numbers import numbers_of as table_of
+from mjx_study.results.rows import meanings_of
+from mjx_study.results.rows import numbers_of as table_of
 from mjx_study.results.variables import CELL, ONSETS
 
 OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")

@@ -18,9 +18,8 @@ import xarray as xr
 from mjx_study import identity
 from mjx_study.digest import digest_of
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.study import StudyCell, StudyPlan
+from mjx_study.experiment.study import StudyCell, StudyError, StudyPlan
 from mjx_study.identity import contents, differences, git_revision
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import warnings_of

@@ -16,15 +16,16 @@ from mjx_study.execution.cells import Cells, compute_here
 from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import descents
-from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import StudyError
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.progress import silent
 from mjx_study.report import render_report
 from mjx_study.results.kind import find_kind, findings_of
 from mjx_study.results.variables import MEASURED
 from mjx_study.results.warnings import warnings_of
-from mjx_study.storage import cell_files, folder
+from mjx_study.storage import arrays as cell_files
+from mjx_study.storage import folder
 from mjx_study.storage.arrays import required
 from mjx_study.storage.folder import Store, load_study
 from tests.documents import content, same, study_document

@@ -19,12 +19,11 @@ from mjx_study import cli
 from mjx_study.execution.cluster import TRIES
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import gradients
-from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.gradients import GradientComputation, block_of, blocks_of
 from mjx_study.experiment.merged_samples import Blocks
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.sampling import cell_keys, sample_keys
-from mjx_study.experiment.study import StudyPlan
+from mjx_study.experiment.study import Arrays, Checkpoint, StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
 from mjx_study.storage.folder import Store, load_study

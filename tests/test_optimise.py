@@ -19,11 +19,10 @@ from mjx_study import cli
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import descent_rollouts, descents, plan, sampling
 from mjx_study.experiment import iteration as descent
-from mjx_study.experiment.checkpoint import Checkpoint
 from mjx_study.experiment.descent_rollouts import Backend
 from mjx_study.experiment.iteration import REASONS, begin, make_optimizer
 from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.study import StudyPlan, estimators_of
+from mjx_study.experiment.study import Checkpoint, StudyPlan, estimators_of
 from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.files import POLICY_OPTIONS
@@ -166,8 +165,8 @@ def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:
     )
     np.testing.assert_allclose(after.theta, [[0.9, 1.9], [1, 2], [1, 2], [1, 2]])
     assert after.reason.tolist() == [0, 1, 3, 4]
-    np.testing.assert_array_equal(np.isnan(record.cost), [False, False, True, False])
-    assert record.nonfinite[1] == 5
+    np.testing.assert_array_equal(np.isnan(record["cost"]), [False, False, True, False])
+    assert record["nonfinite"][1] == 5
 
 
 def test_a_diverging_run_keeps_its_history_and_says_why() -> None:

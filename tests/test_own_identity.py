@@ -19,9 +19,8 @@ import pytest
 
 from estimators import user_inputs
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.study import StudyCell, StudyPlan
+from mjx_study.experiment.study import StudyCell, StudyError, StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.files import read_theta
 from mjx_study.storage.folder import Store

@@ -19,9 +19,8 @@ from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import tally
-from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.study import estimators_of
+from mjx_study.experiment.study import StudyError, estimators_of
 from mjx_study.objective import BlankObjective, MjxObjective, Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.panels import limit

@@ -21,10 +21,9 @@ from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli.sweep import sweep_fields
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.gradients import GradientComputation
 from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.study import estimators_of
+from mjx_study.experiment.study import StudyError, estimators_of
 from mjx_study.objective import Simulator, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import warnings_of

@@ -18,22 +18,18 @@ from mjx_study.choices import FAMILIES as CONTACTS
 from mjx_study.choices import laws_of
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.dynamics import initial_state
-from mjx_study.tasks import make_task
+from mjx_study.tasks import task_with_options
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 FAMILIES: Final = ("penalty", "impedance", "mujoco", "mujoco_stiff", "smooth_onset")
 UNDAMPED: Final = ("penalty", "impedance")
 """Families that keep the task's damping; the others' damping ratio varies."""
-POINTS: Final = 128
-"""Number of cells of each family at each task and timestep."""
+POINTS: Final = 128  # number of cells of each family at each task and timestep
 DAMPRATIO: Final = (0.1, 2.0)
-WIDTH: Final = (3e-4, 3e-2)
-"""Depths over which the impedance of `smooth_onset` rises [m]."""
-OWN_WIDTH: Final = 0.001
-"""That of the others [m]."""
-NOISE: Final = (0.1, 3.0)
-"""Factors on the task's sigma."""
+WIDTH: Final = (3e-4, 3e-2)  # depths over which the impedance of `smooth_onset` rises [m]
+OWN_WIDTH: Final = 0.001  # that of the others [m]
+NOISE: Final = (0.1, 3.0)  # factors on the task's sigma
 LAWS: Final = tuple(laws_of(CONTACTS))
 """Families with a contact law other than MuJoCo's, which the extra `laws` has."""
 SMOOTHING: Final = (0.01, 0.1, 1.0, 10.0)
@@ -66,8 +62,7 @@ TASKS: Final = {
     "tennis": Setting((0.005, 0.01), (200.0, 5e4), (0.0, 0.3), 3e-3),
 }
 """`pusher_apart` is the pusher whose bodies start 10 cm apart, so that they meet."""
-GAP: Final = 0.1
-"""Gap of `pusher_apart` at the start [m]."""
+GAP: Final = 0.1  # gap of `pusher_apart` at the start [m]
 PROGRAMS: Final = tuple((name, timestep) for name, setting in TASKS.items() for timestep in setting.timesteps)
 CELLS: Final = len(PROGRAMS) * POINTS * len(FAMILIES)
 """Cells under MuJoCo's law; indices of the laws' cells start here."""
@@ -158,9 +153,7 @@ def law_cells(program: int, law: str) -> Iterator[Cell]:
 
 def task_of(name: str, timestep: float) -> Task:
     """Return a task at another timestep, with its duration kept."""
-    base = make_task(name.removesuffix("_apart"))
-    steps = round(base.horizon * base.scene.timestep / timestep)
-    task = make_task(name.removesuffix("_apart"), timestep=timestep, horizon=steps)
+    task = task_with_options(name.removesuffix("_apart"), {"timestep": timestep})
     if name.endswith("_apart"):
         qpos = task.start.qpos.at[0].add(-GAP)
         task = task.replace(name=name, start=initial_state(task.scene, qpos))

@@ -33,8 +33,7 @@ TASKS: Final = {
 }
 """Colours of the tasks, in the order of panels."""
 BINS: Final = 8
-RATIOS: Final = (1e-7, 1e7)
-"""Limits of ratios of variances."""
+RATIOS: Final = (1e-7, 1e7)  # limits of ratios of variances
 
 
 def binned(axes: Axes, values: Any, verdict: Any, colour: str) -> None:

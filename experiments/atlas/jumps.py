@@ -5,7 +5,6 @@ of first-order gradients lacks must lie where the cost changes but its derivativ
 """
 
 import itertools
-import json
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +17,7 @@ from jaxtyping import Float
 from scipy.ndimage import median_filter
 
 from estimators import NOISES
-from experiments import DATA
+from experiments import DATA, append_line, read_lines
 from experiments.atlas.design import LAWS, PROGRAMS, Cell, contact_of, law_cells, task_of
 from experiments.atlas.run import RESULTS
 from experiments.atlas.table import LAUNCHED, TOLERANCE, Table, bodies_meet, read
@@ -32,10 +31,8 @@ POINTS: Final = 16_000
 WORST, PARTS, AROUND = 64, 4, 7
 """Intervals of the grid that are searched for jumps, those across which the cost changes most unlike as across the
 median one around; and parts into which each is split in one call."""
-STEEP, NARROW = 1e-6, 1e-9
-"""Widths of what counts as steep and as a jump [rad]."""
-APART: Final = 1e-6
-"""Distance from which paths have parted [m, rad]."""
+STEEP, NARROW = 1e-6, 1e-9  # widths of what counts as steep and as a jump [rad]
+APART: Final = 1e-6  # distance from which paths have parted [m, rad]
 Intervals = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]
 """Both ends [rad], and the costs there."""
 
@@ -119,7 +116,7 @@ def measured(task: Task, line: Line, cell: Cell, contact: ContactModel) -> dict[
 
 def measure_jumps(into: Path = JUMPS) -> None:
     """Measure the cells that a file lacks."""
-    done = {each["index"] for each in load(into)} if into.exists() else set()
+    done = {each["index"] for each in read_lines(into)}
     wanted = [row for _, row in judged(read(RESULTS, laws=True)).iterrows() if int(row["index"]) not in done]
     for program, rows in itertools.groupby(wanted, lambda row: int(row.program)):
         task = task_of(*PROGRAMS[program])
@@ -127,15 +124,14 @@ def measure_jumps(into: Path = JUMPS) -> None:
         for row in rows:
             cell = cells[int(row["index"])]
             found = measured(task, line, cell, contact_of(task, cell))
-            with into.open("a") as file:
-                file.write(json.dumps(found) + "\n")
+            append_line(into, found)
             print(found, flush=True)
 
 
 def results(laws: Table, path: Path = JUMPS) -> Table:
     """Return the measured cells of a table with what quadrature says: `verdict`, 1 where the mean is off, 0 where it is
     right, NaN where the errors allow either; and whether one jump is `large`, beyond the tolerance alone."""
-    table = laws.drop(columns="slope").merge(pd.DataFrame(load(path)), on="index")
+    table = laws.drop(columns="slope").merge(pd.DataFrame(read_lines(path)), on="index")
     slope = table.slope.abs()
     bias, error = (table["first"] - table.slope).abs(), table.first_error + table.slope_error
     verdict = np.where(bias + error <= TOLERANCE * slope, 0.0, np.nan)
@@ -143,8 +139,3 @@ def results(laws: Table, path: Path = JUMPS) -> Table:
     table["large"] = table.largest.abs() > TOLERANCE * slope
     table["unexplained"] = (table["first"] + table.jumps - table.slope).abs() / slope
     return table
-
-
-def load(path: Path = JUMPS) -> list[dict[str, Any]]:
-    """Read what was measured, a line for each cell."""
-    return [json.loads(each) for each in path.read_text().splitlines()]

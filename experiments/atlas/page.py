@@ -32,10 +32,8 @@ from mjx_study.table import markdown_table
 PAGE: Final = DOCS / "atlas.md"
 OF_THE_DESIGN: Final = ("limit", "h_b", "h2_k", "impedance", "periods", "params")
 """Groups that are known without a rollout; for the others, only cells where bodies meet count."""
-STRENGTHS: Final = (0.03, 0.8)
-"""Onset strengths that separate the columns of the table of bounds."""
-BESIDE: Final = ("mujoco", "smooth_onset", "penalty")
-"""Families of MuJoCo's law beside which others are listed."""
+STRENGTHS: Final = (0.03, 0.8)  # onset strengths that separate the columns of the table of bounds
+BESIDE: Final = ("mujoco", "smooth_onset", "penalty")  # families of MuJoCo's law beside which others are listed
 
 
 def share(right: np.ndarray) -> str:

@@ -32,10 +32,8 @@ from mjx_study.simulation.onset import as_row
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
-SAMPLES: Final = 64
-"""First-order samples of a cell, and pairs of rollouts for zeroth order and the reference."""
-BATCHES: Final = 8
-"""Number of batches for the squared bias."""
+SAMPLES: Final = 64  # first-order samples of a cell, and pairs of rollouts for zeroth order and the reference
+BATCHES: Final = 8  # number of batches for the squared bias
 CHUNK: Final = 256
 SEED: Final = 0
 ESTIMATORS: Final = ("zobg", "fobg", "fobg_onset")

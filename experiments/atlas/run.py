@@ -36,14 +36,10 @@ from mjx_study.disk import write_whole
 from mjx_study.runtime import configure, environment
 
 RESULTS: Final = DATA / "atlas.npz"
-BLOCK: Final = 16
-"""Cells computed together."""
-DIGITS: Final = 10
-"""Bits of the mantissa that are kept: a relative error of 5e-4, and a third of the size."""
-FEWEST: Final = 60.0
-"""Remaining time below which no job starts [s]."""
-LARGEST: Final = 200.0
-"""Maximum run time of a job, without compilation [s]; longer ones are split."""
+BLOCK: Final = 16  # cells computed together
+DIGITS: Final = 10  # bits of the mantissa that are kept: a relative error of 5e-4, and a third of the size
+FEWEST: Final = 60.0  # remaining time below which no job starts [s]
+LARGEST: Final = 200.0  # maximum run time of a job, without compilation [s]; longer ones are split
 
 
 @dataclasses.dataclass(frozen=True)

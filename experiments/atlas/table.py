@@ -18,10 +18,8 @@ from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_ST
 
 Table = Any
 """A pandas.DataFrame with a row for each cell; pandas comes without types."""
-TOLERANCE: Final = 0.2
-"""Share of the slope within which a mean counts as right."""
-QUANTILE: Final = 2.58
-"""Standard errors of the 99 % intervals that verdicts on means need."""
+TOLERANCE: Final = 0.2  # share of the slope within which a mean counts as right
+QUANTILE: Final = 2.58  # standard errors of the 99 % intervals that verdicts on means need
 MARKOV: Final = 40.0
 """A mean of numbers >= 0 exceeds this many times its expectation with a probability of at most 1/40."""
 GROUPS: Final = {

@@ -26,18 +26,16 @@ from queue import SimpleQueue
 from threading import Lock
 from typing import Final
 
-from experiments import ROOT
+from experiments import ROOT, append_line
 from experiments.engines.catalog import ENGINES, HOME, interpreter
 from experiments.engines.page import CELLS, CHECKS, PAGE, cells, tables
 from experiments.engines.scenes import SCENES, TIMESTEPS, VARIANTS
 from experiments.pages import write_tables
 
-LIMIT: Final = 900.0
-"""Seconds that a cell may take if `--limit` gives no others."""
+LIMIT: Final = 900.0  # seconds that a cell may take if `--limit` gives no others
 ONE_CORE: Final = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "OMP_NUM_THREADS": "1"}
 """Of cells of which several are measured at a time."""
-TRIAL: Final = ("toss",)
-"""Scenes of `--quick`."""
+TRIAL: Final = ("toss",)  # scenes of `--quick`
 HALF, HIGH = VARIANTS
 CHECKED: Final = (
     *itertools.product(("mjx", "brax_positional", "drake_sap"), (HALF,), TIMESTEPS),
@@ -87,8 +85,8 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
         except subprocess.CalledProcessError as error:
             said = f"FAILED: {error.stderr[-500:]}"
         if line:
-            with writing, target.open("a") as file:
-                file.write(json.dumps(line) + "\n")
+            with writing:
+                append_line(target, line)
         print(*words, said, flush=True)
         cores.put(core)
         return not line
@@ -100,12 +98,12 @@ def run(arguments: argparse.Namespace, target: Path) -> int:
 def merge(files: list[Path]) -> None:
     """Append the cells of other files that the data lack."""
     found = cells(CELLS)
-    with CELLS.open("a") as target:
-        for file in files:
-            new = {key: cell for key, cell in cells(file).items() if key not in found}
-            target.writelines(json.dumps(cell) + "\n" for cell in new.values())
-            found = {**found, **new}
-            print(f"{file}: {len(new)} cells added")
+    for file in files:
+        new = {key: cell for key, cell in cells(file).items() if key not in found}
+        for cell in new.values():
+            append_line(CELLS, cell)
+        found = {**found, **new}
+        print(f"{file}: {len(new)} cells added")
 
 
 def main() -> None:

@@ -7,8 +7,7 @@ from typing import Final
 
 from experiments import ROOT
 
-HOME: Final = ROOT / "build" / "engines"
-"""Environments, one folder each; in none of them is this project installed."""
+HOME: Final = ROOT / "build" / "engines"  # environments, one folder each; in none of them is this project installed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +50,7 @@ class Engine:
 
 
 CUDA: Final = "torch's wheels for Linux bring CUDA"
+SLOW: Final = "not run, at 0.1 to 0.3 s per gradient"
 ENVIRONMENTS: Final = {
     "own": Environment(),
     "brax": Environment(("brax==0.14.2", "mujoco-mjx==3.17.0", "mujoco==4.0.0", "jax==0.10.2")),
@@ -89,33 +89,16 @@ ENGINES: Final = {
             ("generalized_exact", "generalized, exact forces", "forward mode"),
         )
     },
-    **{
-        f"newton_{name}": Engine(f"Newton 1.8.0, {name}", "newton", "newton_warp", name, "Warp's tape", single=True)
-        for name in ("semi_implicit",)
-    },
-    "newton_1_0": Engine(
-        "Newton 1.0.0, semi_implicit",
-        "newton_1_0",
-        "newton_warp",
-        "old",
-        "Warp's tape",
-        single=True,
+    "newton_semi_implicit": Engine(
+        "Newton 1.8.0, semi_implicit", "newton", "newton_warp", "semi_implicit", "Warp's tape", single=True
     ),
+    "newton_1_0": Engine("Newton 1.0.0, semi_implicit", "newton_1_0", "newton_warp", "old", "Warp's tape", single=True),
     "jaxsim": Engine("JaxSim 0.9.0, soft", "jaxsim", "jaxsim_soft", "SemiImplicitEuler", "reverse mode"),
-    **{
-        f"drake_{name}": Engine(f"Drake 1.58.0, {name}", "drake", "drake_plant", name, "AutoDiffXd")
-        for name in ("sap",)
-    },
+    "drake_sap": Engine("Drake 1.58.0, sap", "drake", "drake_plant", "sap", "AutoDiffXd"),
     "nimble": Engine("Nimble 0.10.52", "nimble", "nimble_physics", "lcp", "torch's tape"),
     **{
         f"mujoco_torch_{name}": Engine(
-            f"mujoco-torch 0.2.0, {name}",
-            "mujoco_torch",
-            "mujoco_torch_tape",
-            name,
-            how,
-            slow=True,
-            left="not run, at 0.1 to 0.3 s per gradient",
+            f"mujoco-torch 0.2.0, {name}", "mujoco_torch", "mujoco_torch_tape", name, how, slow=True, left=SLOW
         )
         for name, how in (("plain", "torch's tape"), ("soft", "torch's tape, differentiable_mode"))
     },

@@ -7,14 +7,13 @@ differences of rollouts, and of the mean over the same noise. Both cover the noi
 the other's. What differs by more than `ALLOWED` is left out, counted and named.
 """
 
-import json
 import sys
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 
-from experiments import DATA
+from experiments import DATA, write_json
 from experiments.engines.adapters import mujoco_family
 from experiments.engines.references import NUMBERS
 from experiments.engines.scenes import SCENES, TIMESTEPS, Scene, mjcf, mjcf_index, mjcf_state
@@ -164,7 +163,7 @@ def main() -> None:
         "scenes": {name: describe(name) for name in names},
         "entries": [{"scene": entry["scene"]} for entry in kept],
     }
-    STEM.with_suffix(".json").write_text(json.dumps(index, indent=1) + "\n")
+    write_json(STEM.with_suffix(".json"), index)
     print(f"{len(kept)} entries")
 
 

@@ -15,17 +15,14 @@ import numpy as np
 
 from experiments.engines.scenes import LENGTH, PIVOT, RADIUS, Scene, Simulate, scene_named
 
-REACH: Final = 5.0
-"""The grid's half width, in standard deviations."""
-SHIFT: Final = 0.2
-"""Shift of the parameter on each side in differences of the mean, in standard deviations."""
+REACH: Final = 5.0  # the grid's half width, in standard deviations
+SHIFT: Final = 0.2  # shift of the parameter on each side in differences of the mean, in standard deviations
 MANY: Final = {"grid": 400, "strata": 400, "points": 200}
 MORE: Final = {"grid": 1600, "strata": 1600, "points": 200}
 FEW: Final = {"grid": 100, "strata": 100, "points": 50}
 AGREES, DIFFERS = 0.03, 0.1
 """Relative errors of the mean up to which it is called right, and from which wrong; in between it is close."""
-STILL: Final = 1e-7
-"""Change of the end with the noise [m] up to which a body is called at rest."""
+STILL: Final = 1e-7  # change of the end with the noise [m] up to which a body is called at rest
 POINTS: Final = 0.9
 """Share of the points at which a derivative must be that of differences for it to be called right there."""
 

@@ -6,13 +6,12 @@ The cost of a rollout is linear . p + quadratic . (p - target)^2 of the position
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 GRAVITY: Final = 9.81
-RADIUS: Final = 0.1
-"""Radius of spheres, and half edge of boxes [m]."""
+RADIUS: Final = 0.1  # radius of spheres, and half edge of boxes [m]
 LENGTH, LIMIT, PIVOT = 0.5, 0.5, 2.0
 """The pendulum's length [m], the angle of its limit from below [rad], the height of its hinge [m]."""
 
@@ -141,6 +140,21 @@ def rigid_bounce(z: np.ndarray) -> np.ndarray:
     return RADIUS + 0.5 * speed * left - GRAVITY * left**2 / 2
 
 
+def rigid_slide(speed: np.ndarray) -> np.ndarray:
+    """Way of `slide` until friction has stopped it [m]."""
+    return speed**2 / (2 * 0.5 * GRAVITY)
+
+
+def rigid_wall(speed: np.ndarray) -> np.ndarray:
+    """End of `wall`, 0.3 m from the wall at its start and thrown back at half its speed [m]."""
+    return np.where(speed * 0.5 < 0.3, 0.5 * speed, 0.3 - 0.5 * (0.5 * speed - 0.3))
+
+
+def rigid_push(speed: np.ndarray) -> np.ndarray:
+    """End of the second sphere of `push`, which takes half the speed [m]."""
+    return 0.4 + np.maximum(0.5 * speed - 0.2, 0) / 2
+
+
 def rigid_landing(z: np.ndarray) -> np.ndarray:
     """Cost of `box_flat`: friction takes half the speed of landing from 1 m/s at once, then brakes what is left."""
     touch, speed = rigid_fall(z - RADIUS, 1.0)
@@ -149,69 +163,22 @@ def rigid_landing(z: np.ndarray) -> np.ndarray:
 
 LANDED: Final = ((0.0, 0.0, 100.0),)
 AT_REST: Final = ((0.0, 0.0, RADIUS),)
+ALONG, UP, BOTH = ((1.0, 0.0, 0.0),), ((0.0, 0.0, 1.0),), ((1.0, 0.0, 1.0),)  # linear costs of one body
+FLYING: Final[dict[str, Any]] = {"gravity": 0, "floor": False}
 EDGE: Final = math.pi / 6
+BALLS: Final = (Body("sphere", (0, 0, 1), (1, 0, 0)), Body("sphere", (0.4, 0, 1)))
+BALL, FALLING = Body("sphere", (0, 0, 0.15), (1, 0, -1)), Body("sphere", (0, 0, 0.3), (0, 0, -1))
+SLIDING, LANDING = Body("box", (0, 0, RADIUS), (1, 0, 0)), Body("box", (0, 0, 0.15), (1, 0, -1))
+TILTED, SWINGING = Body("box", (0, 0, 0.2), (0.5, 0, -1), EDGE), Body("pendulum", tilt=-0.5, spin=3.0)
 SCENES: Final = {
-    "toss": Scene(
-        (Body("sphere", (0, 0, 0.15), (1, 0, -1)),), "z", 0.15, 0.01, 0.4, ((1, 0, 1),), LANDED, AT_REST, friction=1.0
-    ),
-    "bounce": Scene(
-        (Body("sphere", (0, 0, 0.3), (0, 0, -1)),),
-        "z",
-        0.3,
-        0.04,
-        0.3,
-        ((0, 0, 1),),
-        restitution=0.5,
-        exact=rigid_bounce,
-    ),
-    "slide": Scene(
-        (Body("box", (0, 0, RADIUS), (1, 0, 0)),),
-        "vx",
-        1.0,
-        0.1,
-        0.5,
-        ((1, 0, 0),),
-        exact=lambda speed: speed**2 / (2 * 0.5 * GRAVITY),
-    ),
-    "wall": Scene(
-        (Body("sphere", (0, 0, 1), (1, 0, 0)),),
-        "vx",
-        1.0,
-        0.1,
-        0.5,
-        ((1, 0, 0),),
-        gravity=0,
-        floor=False,
-        wall=0.4,
-        restitution=0.5,
-        exact=lambda speed: np.where(speed * 0.5 < 0.3, 0.5 * speed, 0.3 - 0.5 * (0.5 * speed - 0.3)),
-    ),
-    "push": Scene(
-        (Body("sphere", (0, 0, 1), (1, 0, 0)), Body("sphere", (0.4, 0, 1))),
-        "vx",
-        1.0,
-        0.1,
-        0.5,
-        ((0, 0, 0), (1, 0, 0)),
-        gravity=0,
-        floor=False,
-        exact=lambda speed: 0.4 + np.maximum(0.5 * speed - 0.2, 0) / 2,
-    ),
-    "box_flat": Scene(
-        (Body("box", (0, 0, 0.15), (1, 0, -1)),),
-        "z",
-        0.15,
-        0.015,
-        0.4,
-        ((1, 0, 1),),
-        LANDED,
-        AT_REST,
-        exact=rigid_landing,
-    ),
-    "box_edge": Scene(
-        (Body("box", (0, 0, 0.2), (0.5, 0, -1), EDGE),), "z", 0.2, 0.015, 0.4, ((1, 0, 1),), LANDED, AT_REST
-    ),
-    "pendulum": Scene((Body("pendulum", tilt=-0.5, spin=3.0),), "spin", 4.0, 0.3, 0.5, ((1, 0, 0),), floor=False),
+    "toss": Scene((BALL,), "z", 0.15, 0.01, 0.4, BOTH, LANDED, AT_REST, friction=1.0),
+    "bounce": Scene((FALLING,), "z", 0.3, 0.04, 0.3, UP, restitution=0.5, exact=rigid_bounce),
+    "slide": Scene((SLIDING,), "vx", 1.0, 0.1, 0.5, ALONG, exact=rigid_slide),
+    "wall": Scene(BALLS[:1], "vx", 1.0, 0.1, 0.5, ALONG, wall=0.4, restitution=0.5, exact=rigid_wall, **FLYING),
+    "push": Scene(BALLS, "vx", 1.0, 0.1, 0.5, ((0, 0, 0), *ALONG), exact=rigid_push, **FLYING),
+    "box_flat": Scene((LANDING,), "z", 0.15, 0.015, 0.4, BOTH, LANDED, AT_REST, exact=rigid_landing),
+    "box_edge": Scene((TILTED,), "z", 0.2, 0.015, 0.4, BOTH, LANDED, AT_REST),
+    "pendulum": Scene((SWINGING,), "spin", 4.0, 0.3, 0.5, ALONG, floor=False),
 }
 VARIANTS: Final[dict[str, Scene]] = {
     "toss, half the noise": dataclasses.replace(SCENES["toss"], sigma=SCENES["toss"].sigma / 2),

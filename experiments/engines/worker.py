@@ -13,8 +13,7 @@ from experiments.engines.catalog import ENGINES
 from experiments.engines.judge import FEW, MANY, MORE, measure, verdict
 from experiments.engines.scenes import CannotError, scene_named
 
-VERSIONED = ("jax", "mujoco", "torch")
-"""Packages whose version a cell records."""
+VERSIONED = ("jax", "mujoco", "torch")  # packages whose version a cell records
 APART = 10.0
 
 

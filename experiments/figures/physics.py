@@ -1,6 +1,7 @@
 """docs/physics.png: the tasks against closed forms and references without MJX."""
 
 import math
+from typing import Any
 
 import jax
 import numpy as np
@@ -101,20 +102,10 @@ def transferred(axes: Axes) -> None:
         closed_form(axes, fine, np.sqrt(-exact), colour)
         cost = run(task, coarse[:, None], contact_of(task, family, 10000.0)).cost
         simulated(axes, coarse, np.sqrt(-cost), colour, label=label, size=3)
-    axes.plot(
-        fine,
-        np.where(fine <= math.pi / 4, np.sin(fine), 0),
-        color=GREY,
-        linewidth=1,
-        linestyle=":",
-        label="inelastic, rigid bar: sin(angle)",
-    )
-    axes.set(
-        title="momentum_transfer: the bar",
-        xlabel="launch angle [rad]",
-        ylabel="angular momentum / (m v d)",
-        ylim=(-0.06, 1.85),
-    )
+    rigid = np.where(fine <= math.pi / 4, np.sin(fine), 0)
+    axes.plot(fine, rigid, color=GREY, linewidth=1, linestyle=":", label="inelastic, rigid bar: sin(angle)")
+    axes.set(title="momentum_transfer: the bar", xlabel="launch angle [rad]", ylim=(-0.06, 1.85))
+    axes.set_ylabel("angular momentum / (m v d)")
     axes.legend(loc="upper left")
 
 
@@ -131,19 +122,11 @@ def deflection(axes: Axes) -> None:
         still = np.zeros((len(fine), task.horizon, 3))
         end = roll_out(Tennis(), starts(fine, tilt), still, np.zeros((3, 7))).states[:, -1]
         closed_form(axes, fine, _direction(end[:, 2:4]), colour)
-        qvel = run(
-            task,
-            np.zeros((len(coarse), 21)),
-            contact_of(task, "penalty", 10000.0),
-            tennis_starts(task, starts(coarse, tilt)),
-        ).qvel[:, -1]
+        thrown, contact = tennis_starts(task, starts(coarse, tilt)), contact_of(task, "penalty", 10000.0)
+        qvel = run(task, np.zeros((len(coarse), 21)), contact, thrown).qvel[:, -1]
         simulated(axes, coarse, _direction(qvel), colour, label=f"tilt {tilt:g} rad", size=3)
-    axes.set(
-        title="tennis: direction after the bounce",
-        xlabel="ball right of the paddle's middle [m]",
-        ylabel="angle from straight up [deg]",
-        yticks=(0, 45, 90, 135, 180),
-    )
+    axes.set(title="tennis: direction after the bounce", yticks=(0, 45, 90, 135, 180))
+    axes.set(xlabel="ball right of the paddle's middle [m]", ylabel="angle from straight up [deg]")
     axes.legend(loc="upper center")
 
 
@@ -171,33 +154,17 @@ def separation(axes: Axes) -> None:
 
 
 def convergence(axes: Axes) -> None:
+    hollow: dict[str, Any] = {"markersize": 4, "markerfacecolor": "none", "linewidth": 0}
     for label, colour, marker, stiffnesses, errors in (thrown_errors(), shot_errors(), played_errors()):
-        for step, (error, face) in enumerate(zip(errors, (colour, "none"), strict=True)):
-            shown = label if step == 0 else None
-            axes.plot(
-                stiffnesses,
-                error,
-                color=colour,
-                marker=marker,
-                markersize=4,
-                markerfacecolor=face,
-                label=shown,
-                linewidth=1.2 if step == 0 else 0,
-            )
-    axes.plot(
-        [], [], color=GREY, marker="o", markersize=4, markerfacecolor="none", linewidth=0, label="the task's own step"
-    )
+        finer, own = errors
+        axes.plot(stiffnesses, finer, color=colour, marker=marker, markersize=4, label=label, linewidth=1.2)
+        axes.plot(stiffnesses, own, color=colour, marker=marker, **hollow)
+    axes.plot([], [], color=GREY, marker="o", label="the task's own step", **hollow)
     guide = np.array([4e3, 1e5])
     axes.plot(guide, 9 * guide**-0.5, color=GREY, linewidth=1, linestyle="--")
     axes.text(2.5e4, 9 * 2.5e4**-0.5, "1 / sqrt(K)", color=GREY, fontsize=8.5, va="bottom")
-    axes.set(
-        ylim=(1e-3, 0.4),
-        title="error against stiffness",
-        xlabel="stiffness K [N/m]",
-        ylabel="relative error",
-        xscale="log",
-        yscale="log",
-    )
+    axes.set(title="error against stiffness", xlabel="stiffness K [N/m]", ylabel="relative error")
+    axes.set(xscale="log", yscale="log", ylim=(1e-3, 0.4))
     axes.legend(loc="lower left")
 
 
@@ -235,16 +202,12 @@ def played_errors():
     errors = []
     for split in (5, 1):
         task = task_of("tennis", timestep=0.005 / split, horizon=200 * split)
-        exact = roll_out(
-            Tennis(timestep=0.05 / split, damping=0.999 ** (1 / split)), drawn, np.zeros((64, task.horizon, 3)), gains
-        ).states[:, -1, :2]
+        system, still = Tennis(timestep=0.05 / split, damping=0.999 ** (1 / split)), np.zeros((64, task.horizon, 3))
+        exact = roll_out(system, drawn, still, gains).states[:, -1, :2]
         way = np.linalg.norm(exact - drawn[:, :2], axis=1)
-        row = []
+        thetas, starts, row = np.tile(gains.ravel(), (64, 1)), tennis_starts(task, drawn), []
         for stiffness in stiffnesses:
-            thetas = np.tile(gains.ravel(), (64, 1))
-            found = run(task, thetas, contact_of(task, "penalty", stiffness), tennis_starts(task, drawn)).qpos[
-                :, -1, :2
-            ]
+            found = run(task, thetas, contact_of(task, "penalty", stiffness), starts).qpos[:, -1, :2]
             row.append(np.median(np.linalg.norm(found - exact, axis=1) / way))
         errors.append(row)
     return "tennis: end of the ball's flight", GREEN, "^", stiffnesses, errors
@@ -265,13 +228,8 @@ def impedance(axes: Axes) -> None:
     guide = np.array([3e-3, 1e-1])
     axes.plot(guide, 1e-5 * guide, color=GREY, linewidth=1, linestyle="--")
     axes.text(0.1, 6e-8, "proportional to d", color=GREY, fontsize=8.5, ha="right", va="top")
-    axes.set(
-        title="pusher: error against impedance",
-        xlabel="impedance d",
-        ylabel="largest error [m]",
-        xscale="log",
-        yscale="log",
-    )
+    axes.set(title="pusher: error against impedance", xlabel="impedance d", ylabel="largest error [m]")
+    axes.set(xscale="log", yscale="log")
     axes.legend(loc="upper left")
 
 

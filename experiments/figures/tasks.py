@@ -172,9 +172,8 @@ def robot_panel(name: str, seed: int, view: str, shown: Sequence[tuple[int, str]
     task = task_of(name)
     assert callable(task.start)
     start = jax.tree.map(lambda leaf: leaf[None], task.start(jax.random.key(seed)))
-    qpos = run(
-        task, np.asarray(task.theta)[None], contact_of(task, "mujoco", task.defaults.middle_stiffness), start
-    ).qpos[0]
+    contact = contact_of(task, "mujoco", task.defaults.middle_stiffness)
+    qpos = run(task, np.asarray(task.theta)[None], contact, start).qpos[0]
 
     def draw(axes: Axes) -> None:
         drawing = drawing_of(task, qpos, view)
@@ -182,13 +181,8 @@ def robot_panel(name: str, seed: int, view: str, shown: Sequence[tuple[int, str]
         for rank, (step, text) in enumerate(shown):
             for added in drawing.pose(axes, step):
                 added.set_transform(Affine2D().translate(rank * apart, 0) + axes.transData)
-            note(
-                axes,
-                rank * apart,
-                corners["high"][1] - 0.04 * apart,
-                f"{step * task.scene.timestep:g} s: {text}",
-                va="top",
-            )
+            height, said = corners["high"][1] - 0.04 * apart, f"{step * task.scene.timestep:g} s: {text}"
+            note(axes, rank * apart, height, said, va="top")
 
     return Panel(name, f"neural network, {task.policy.num_params} weights", bar=0.1, draw=draw, **corners)
 

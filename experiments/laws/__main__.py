@@ -20,36 +20,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments import DOCS
-from experiments.laws import measure
-from experiments.laws.measure import (
-    SAMPLED,
-    TRAINED,
-    afloat,
-    bodies,
-    checked,
-    compared,
-    corner,
-    faithful,
-    integrated,
-    sampled,
-    trained,
-)
-from experiments.laws.page import (
-    AFLOAT,
-    CELLS,
-    CHECKED,
-    CHECKS,
-    CORNER,
-    LAWS,
-    LONGER,
-    PYRAMIDAL,
-    RIGID,
-    TOSSES,
-    ZEROTH,
-    measured,
-    tables,
-)
+from experiments import DOCS, append_line
+from experiments.laws import measure, page
 from experiments.pages import write_tables
 from mjx_study.runtime import configure
 from mjx_study.simulation.law import LAWS as OTHERS
@@ -63,31 +35,29 @@ MORE: Final = (
 def cells() -> dict[tuple[str, str], Callable[[], dict[str, Any]]]:
     """What is measured, by scene and row."""
     found: dict[tuple[str, str], Callable[[], dict[str, Any]]] = {}
-    for scene, (row, each) in itertools.product(("throw", "faithful", "ball_wall"), LAWS.items()):
-        found[scene, row] = partial(faithful, each[0]) if scene == "faithful" else partial(integrated, scene, *each)
-    for name in TRAINED:
-        for row, each in LAWS.items():
-            found[f"train {name}", row] = partial(trained, name, *each, "fobg")
-        found[f"train {name}", ZEROTH] = partial(trained, name, *LAWS["MuJoCo's default"], "zobg")
-        for row, longer in LONGER.items():
-            found[f"train {name}", row] = partial(trained, name, *longer)
-        for row, each in LAWS.items() if name == "ball_wall" else ():
-            found["pusher", row] = partial(sampled, "pusher", *each)
-    for row, scale in itertools.product(("log_barrier", "hunt_crossley"), (0.1, 10.0)):
-        found[f"throw, kappa {scale:g}", row] = partial(integrated, "throw", row, "none", scale)
-    for scene, (row, each) in itertools.product(MORE, LAWS.items()):
-        found[scene, row] = partial(sampled if scene in SAMPLED else integrated, scene, *each)
-    found |= {(scene, row): partial(integrated, scene, *LAWS[row]) for scene, row in TOSSES}
-    for row, scale in itertools.product(("kelvin_voigt", "conic"), (0.1, 10.0)):
-        found[f"throw, kappa {scale:g}", row] = partial(integrated, "throw", row, "none", scale)
-    for row in (*LAWS, RIGID):
-        if row not in LAWS or LAWS[row][1] == "none":
-            found["faithful bodies", row] = partial(bodies, LAWS[row][0] if row in LAWS else RIGID)
-    found |= {("corner", row): partial(corner, **changes) for row, changes in CORNER.items()}
-    found |= {("afloat", row): partial(afloat, *each) for row, each in AFLOAT.items()}
-    for name, law, cone in itertools.product(CHECKED, OTHERS, ("", "pyramidal")):
-        if not cone or (name, law) in PYRAMIDAL:
-            for kind, compute in (("gradcheck", checked), ("compare", compared)):
+    for scene, (row, each) in itertools.product(("throw", "faithful", "ball_wall"), page.LAWS.items()):
+        means = partial(measure.integrated, scene, *each)
+        found[scene, row] = partial(measure.faithful, each[0]) if scene == "faithful" else means
+    for name in measure.TRAINED:
+        for row, each in page.LAWS.items():
+            found[f"train {name}", row] = partial(measure.trained, name, *each, "fobg")
+        found[f"train {name}", page.ZEROTH] = partial(measure.trained, name, *page.LAWS["MuJoCo's default"], "zobg")
+        for row, longer in page.LONGER.items():
+            found[f"train {name}", row] = partial(measure.trained, name, *longer)
+        for row, each in page.LAWS.items() if name == "ball_wall" else ():
+            found["pusher", row] = partial(measure.sampled, "pusher", *each)
+    for row, scale in itertools.product(OTHERS, (0.1, 10.0)):
+        found[f"throw, kappa {scale:g}", row] = partial(measure.integrated, "throw", row, "none", scale)
+    for scene, (row, each) in itertools.product(MORE, page.LAWS.items()):
+        found[scene, row] = partial(measure.sampled if scene in measure.SAMPLED else measure.integrated, scene, *each)
+    found |= {(scene, row): partial(measure.integrated, scene, *page.LAWS[row]) for scene, row in page.TOSSES}
+    plain = {row: law for row, (law, onset) in page.LAWS.items() if onset == "none"} | {page.RIGID: page.RIGID}
+    found |= {("faithful bodies", row): partial(measure.bodies, law) for row, law in plain.items()}
+    found |= {("corner", row): partial(measure.corner, **changes) for row, changes in page.CORNER.items()}
+    found |= {("afloat", row): partial(measure.afloat, *each) for row, each in page.AFLOAT.items()}
+    for name, law, cone in itertools.product(page.CHECKED, OTHERS, ("", "pyramidal")):
+        if not cone or (name, law) in page.PYRAMIDAL:
+            for kind, compute in (("gradcheck", measure.checked), ("compare", measure.compared)):
                 found[f"{kind} {name}{' ' * bool(cone)}{cone}", law] = partial(compute, name, law, cone)
     return found
 
@@ -103,7 +73,7 @@ def wanted(scenes: list[str], rows: list[str]) -> dict[tuple[str, str], Callable
 
 def run(asked: dict[tuple[str, str], Callable[[], dict[str, Any]]], into: Path | None) -> None:
     """Append what is missing of the cells asked for."""
-    known = measured(*filter(None, [into]))
+    known = page.measured(*filter(None, [into]))
     for (scene, row), compute in asked.items():
         if (scene, row) in known:
             continue
@@ -117,8 +87,7 @@ def run(asked: dict[tuple[str, str], Callable[[], dict[str, Any]]], into: Path |
             for name, each in numbers.items()
         }
         checks = scene.startswith(("gradcheck", "compare", "corner", "afloat"))
-        with (into or (CHECKS if checks else CELLS)).open("a") as file:
-            file.write(json.dumps({"scene": scene, "row": row, **numbers}) + "\n")
+        append_line(into or (page.CHECKS if checks else page.CELLS), {"scene": scene, "row": row, **numbers})
         print(f"{scene}, {row}: {time.perf_counter() - begin:.0f} s", flush=True)
 
 
@@ -133,11 +102,11 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=measure.POINTS, help="of quadrature, samples, pairs")
     arguments = parser.parse_args()
     if arguments.what == ["page"]:
-        write_tables(DOCS / "which-contact.md", tables())
+        write_tables(DOCS / "which-contact.md", page.tables())
         return
     asked = wanted([each for each in arguments.what if each != "list"], arguments.row)
     if "list" in arguments.what:
-        known = measured()
+        known = page.measured()
         print(*(json.dumps(key) for key in asked if key not in known), sep="\n")
         return
     if arguments.points != measure.POINTS and arguments.into is None:

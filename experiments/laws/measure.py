@@ -26,13 +26,7 @@ from mjx_study.gradcheck import gradcheck, plan_gradcheck
 from mjx_study.objective import Simulator, compiled_rollout
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.rows import rows_of
-from mjx_study.simulation.contact import (
-    ContactModel,
-    apply_contact,
-    cone_edges,
-    family_model,
-    stiffness_from_solref,
-)
+from mjx_study.simulation.contact import ContactModel, apply_contact, cone_edges, family_model, stiffness_from_solref
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.law import make_law
@@ -40,13 +34,10 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.task import Task
 
-POINTS, CHUNK = 4000, 250
-"""Points, samples and pairs; samples per call."""
-MANY_JOINTS: Final = 10
-"""Degrees of freedom from which a quarter of the points must do."""
+POINTS, CHUNK = 4000, 250  # points, samples and pairs; samples per call
+MANY_JOINTS: Final = 10  # degrees of freedom from which a quarter of the points must do
 GRAVITY, FINE = 9.81, 0.002  # [m/s^2], [s]
-SLOPE: Final = 0.5
-"""Of the ground on which a ball of friction 1 rests."""
+SLOPE: Final = 0.5  # of the ground on which a ball of friction 1 rests
 STEPS: Final = (0.001, 0.002, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08)
 STIFF, SHORT = (0.001, 1.0), 1e-4  # solref and [s] of `RIGID`
 SAMPLED: Final = ("pusher", "tennis", "landing")
@@ -55,21 +46,25 @@ TRAINED: Final[dict[str, dict[str, Any]]] = {
     "ball_wall": {"iterations": 40, "samples": (30,), "learning_rate": 1.0},
 }
 SEEDS, DRAWS = 3, 1000
-BATCH: Final = 1000
-"""Samples, and pairs of rollouts of the reference, of `compared`."""
+BATCH: Final = 1000  # samples, and pairs of rollouts of the reference, of `compared`
 AFLOAT: Final = 300
 DURATION, NARROW = 0.8, 1e-6  # [s], [rad]
 
 
+def as_stiff(task: Task, family: str) -> dict[str, Any]:
+    """Return the options of a family that has MuJoCo's default stiffness, and none if it takes no stiffness."""
+    of = FAMILIES[family]
+    stiffness = stiffness_from_solref(DEFAULT_SOLREF, effective_mass=task.effective_mass)[0]
+    damping = None if of.dampratio or of.smoothing else task.defaults.damping
+    return {"stiffness": stiffness, "damping": damping} if of.swept else {}
+
+
 def member(task: Task, family: str, scale: float = 1.0) -> ContactModel:
     """Return the contact model of a family at MuJoCo's default stiffness; `scale` multiplies its smoothing."""
-    of = FAMILIES[family]
     assert task.contact_pair is not None
     given: dict[str, Any] = {"effective_mass": task.effective_mass, "edges": cone_edges(task.scene, *task.contact_pair)}
-    if of.swept:
-        given["stiffness"] = stiffness_from_solref(DEFAULT_SOLREF, effective_mass=task.effective_mass)[0]
-        given["damping"] = None if of.dampratio or of.smoothing else task.defaults.damping
-    return family_model(family, task.scene, smoothing=of.smoothing * scale or None, **given)
+    smoothing = FAMILIES[family].smoothing * scale or None
+    return family_model(family, task.scene, smoothing=smoothing, **given, **as_stiff(task, family))
 
 
 def unmapped(family: str) -> ContactModel:
@@ -227,11 +222,10 @@ def bodies(family: str) -> dict[str, Any]:
 def trained(name: str, family: str, onset: str, estimator: str, times: int = 1) -> dict[str, Any]:
     """Costs of the policies that descents reach under a law, and of the same in the C engine with MuJoCo's default;
     `times` multiplies the iterations."""
-    task, of = make_task(name), FAMILIES[family]
+    task = make_task(name)
     given: dict[str, Any] = TRAINED[name] | {"iterations": times * TRAINED[name]["iterations"]}
-    if of.swept:
-        given["stiffness"] = (stiffness_from_solref(DEFAULT_SOLREF, effective_mass=task.effective_mass)[0],)
-        given["damping"] = None if of.dampratio or of.smoothing else task.defaults.damping
+    if stiff := as_stiff(task, family):
+        given |= stiff | {"stiffness": (stiff["stiffness"],)}
     about = StudyConfig(
         kind="descents", tasks=(name,), contact=(family,), estimators=(estimator,), seeds=SEEDS, onset=onset, **given
     )
@@ -274,8 +268,7 @@ def executed(task: Task, theta: Any) -> float:
 def checked(name: str, family: str, cone: str) -> dict[str, Any]:
     """Verdict and largest errors of `gradcheck` under a law, at the task's middle stiffness."""
     task = make_task(name, **({"cone": cone} if cone else {}))
-    stiffnesses = task.defaults.stiffnesses
-    swept = (float(stiffnesses[len(stiffnesses) // 2]),) if FAMILIES[family].swept else None
+    swept = (task.defaults.middle_stiffness,) if FAMILIES[family].swept else None
     report = gradcheck(plan_gradcheck(task, (family,), swept, seed=0))
     (of_cost,), (of_step,) = report.costs, report.steps
     return {
@@ -291,19 +284,11 @@ def checked(name: str, family: str, cone: str) -> dict[str, Any]:
 
 def compared(name: str, family: str, cone: str, smoothing: float | None = None) -> dict[str, Any]:
     """What `compare` says of first order's mean under a law, at the task's middle stiffness."""
-    stiffnesses = make_task(name).defaults.stiffnesses
     given: dict[str, Any] = {"cone": (cone,)} if cone else {}
-    given["smoothing"] = smoothing
+    given |= {"smoothing": smoothing, "samples": (BATCH,), "reference_samples": BATCH}
     if FAMILIES[family].swept:
-        given["stiffness"] = (float(stiffnesses[len(stiffnesses) // 2]),)
-    about = StudyConfig(
-        tasks=(name,),
-        contact=(family,),
-        estimators=("zobg", "fobg"),
-        samples=(BATCH,),
-        reference_samples=BATCH,
-        **given,
-    )
+        given["stiffness"] = (make_task(name).defaults.middle_stiffness,)
+    about = StudyConfig(tasks=(name,), contact=(family,), estimators=("zobg", "fobg"), **given)
     zeroth, first = rows_of(run_study(about))
     return {
         "verdict": first.bias_verdict,

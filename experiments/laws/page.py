@@ -1,7 +1,6 @@
 """Tables of docs/which-contact.md, from data/laws.jsonl and data/laws_checks.jsonl alone."""
 
 import itertools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -9,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from scipy import stats
 
-from experiments import DATA
+from experiments import DATA, read_lines
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.simulation.law import LAWS as OTHERS
 from mjx_study.table import markdown_table
@@ -30,8 +29,7 @@ TOSSES: Final = tuple(
     for step in (("5", "2", "0.5") if row not in OTHERS else ("5", "2"))
 )
 """Scene and row of the lines of the table `toss`."""
-RIGID: Final = "rigid"
-"""In place of a law: the C engine's limit of stiff contact and short steps."""
+RIGID: Final = "rigid"  # in place of a law: the C engine's limit of stiff contact and short steps
 ZEROTH: Final = "MuJoCo's default, zeroth order"
 LONGER: Final = {
     "the same, 5 x the iterations": (*LAWS["MuJoCo's default"], "zobg", 5),
@@ -59,8 +57,8 @@ CHECKED: Final = tuple(name for name in TASK_DESCRIPTIONS if not name.endswith("
 
 def measured(*others: Path) -> dict[tuple[str, str], dict[str, Any]]:
     """The numbers of both files, and of others, by scene and row."""
-    lines = [line for path in (CELLS, CHECKS, *others) if path.exists() for line in path.read_text().splitlines()]
-    return {(each.pop("scene"), each.pop("row")): each for each in map(json.loads, lines)}
+    every = itertools.chain.from_iterable(map(read_lines, (CELLS, CHECKS, *others)))
+    return {(each.pop("scene"), each.pop("row")): each for each in every}
 
 
 def tables() -> dict[str, str]:

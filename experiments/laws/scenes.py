@@ -17,11 +17,9 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
 TIMESTEP, GAP, SPREAD, WIDE = 0.005, 0.05, 0.005, 0.05  # [s], [m], [m], [m]
-TOSSED: Final = (0.005, 0.002, 0.0005)
-"""Timesteps of `toss` [s]."""
-SPEED, RADIUS, MASS = 1.0, 0.1, 1.0  # [m/s], [m], [kg]
-CROUCH: Final = 0.05
-"""Noise of a standing robot's posture [rad]."""
+TOSSED: Final = (0.005, 0.002, 0.0005)  # timesteps of `toss` [s]
+SPEED, RADIUS = 1.0, 0.1  # [m/s], [m]
+CROUCH: Final = 0.05  # noise of a standing robot's posture [rad]
 PLANE: Final = """<mujoco><option timestep="{}"/><worldbody><geom name="floor" type="plane" size="20 20 1" condim="3"/>
   {}</worldbody></mujoco>"""
 THROWN: Final = """<body pos="0 0 {}"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>{}</body>"""

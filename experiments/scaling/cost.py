@@ -11,6 +11,7 @@ from typing import Any, Final
 import jax
 import numpy as np
 
+from experiments import write_json
 from experiments.scaling.models import chain, feet, task_of
 from experiments.timing import interleaved
 from mjx_study.objective import Simulator, spread
@@ -21,8 +22,7 @@ from mjx_study.tasks.task import Task
 
 KINDS: Final = ("value", "gradient")
 REPEATS: Final = 7
-LIMIT: Final = 6.0
-"""Seconds after which a measurement is not repeated."""
+LIMIT: Final = 6.0  # seconds after which a measurement is not repeated
 BASE: Final = "pusher"
 HORIZON: Final = 20
 SPREAD_HORIZON: Final = 200
@@ -113,7 +113,7 @@ def measure_cost(seconds: float, output: Path, axes: list[str]) -> None:
         document["measured"].append({"axis": axis, "at": at, **sizes, "ratio": ratio, "seconds": min(taken["own"])})
         bases += [other / steps for other in taken["base"]]
         document["base"] = {"task": BASE, "steps": HORIZON, "samples": chunk, "step": statistics.median(bases)}
-        output.write_text(json.dumps(document, indent=1) + "\n")
+        write_json(output, document)
         print(f"{clock() - begun:6.0f} s  {axis:9} {at:8} {sizes['kind']:9} {min(taken['own']):9.4g} s", flush=True)
     print(f"{len(document['left_out'])} left out for lack of time")
 

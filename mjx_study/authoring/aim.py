@@ -13,19 +13,15 @@ import numpy as np
 
 from mjx_study.authoring.trial import Drive, Trial, moments_of, start_of
 
-MOVED: Final = 1e-6
-"""Spread of an end that counts as moved by noise [m or rad]."""
+MOVED: Final = 1e-6  # spread of an end that counts as moved by noise [m or rad]
 TYPICAL: Final = 1.5
 """Standard deviation of normal numbers in median absolute deviations; a single fall or throw does not count."""
-LEAST: Final = 0.02
-"""Least distance of a goal, in extents of the model, or of a body's own coordinate [rad]."""
+LEAST: Final = 0.02  # least distance of a goal, in extents of the model, or of a body's own coordinate [rad]
 HINGE: Final = int(mujoco.mjtJoint.mjJNT_HINGE)
-BEYOND: Final = 0.25
-"""Share of that distance over which held controls must move a body for it to have a goal."""
+BEYOND: Final = 0.25  # share of that distance over which held controls must move a body for it to have a goal
 REACHED: Final = 0.25
 """Share of the ends under held controls from which on a side counts as within reach; else the goal is on the other."""
-FORWARD: Final = 0.3
-"""Share of the greatest spread along an axis from which on the x axis is preferred."""
+FORWARD: Final = 0.3  # share of the greatest spread along an axis from which on the x axis is preferred
 
 
 @dataclasses.dataclass(frozen=True)

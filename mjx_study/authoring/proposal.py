@@ -12,26 +12,20 @@ from mjx_study.authoring.aim import Aim, choose_aim, rounded
 from mjx_study.authoring.trial import MOST_TRIED, SECONDS, Drive, Touch, Trial, moments_of, run_trial, start_of
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.scene import Scene
+from mjx_study.table import grouped
 
-TRIALS: Final = 16
-"""Test rollouts with noise, and as many with held controls."""
-NOISE: Final = 0.1
-"""Noise: share of half a control's range or of its substitute, or [m/s, rad/s] of velocities."""
-LIFTING: Final = 2.0
-"""Half range of a motor that has none, in controls that hold the model against gravity."""
-HELD: Final = 10
-"""Largest held change, in standard deviations of the noise: the whole range of a control."""
-USUAL: Final = 0.5
-"""Shortest duration of a rollout, if `MOST` steps allow it [s]."""
-FEWEST, MOST = 20, 300
-"""Numbers of steps of a rollout."""
+TRIALS: Final = 16  # test rollouts with noise, and as many with held controls
+NOISE: Final = 0.1  # share of half a control's range or of its substitute, or [m/s, rad/s] of velocities
+LIFTING: Final = 2.0  # half range of a motor that has none, in controls that hold the model against gravity
+HELD: Final = 10  # largest held change, in standard deviations of the noise: the whole range of a control
+USUAL: Final = 0.5  # shortest duration of a rollout, if `MOST` steps allow it [s]
+FEWEST, MOST = 20, 300  # numbers of steps of a rollout
 SINKING: Final = 0.2
 """Greatest depth of a contact at the lowest stiffness, as a share of the smaller geom's least half size."""
 RESOLVED: Final = 0.5
 """h sqrt(K / m) at the highest stiffness: 13 steps in a contact's period; a critically damped one is stable to 0.83."""
 STIFFNESSES: Final = 4
-WEIGHT: Final = 0.01
-"""Cost of holding all controls at their largest change."""
+WEIGHT: Final = 0.01  # cost of holding all controls at their largest change
 ITERATIONS, SAMPLES = 100, 20
 PACE: Final = 0.3
 """Learning rate of Adam, in standard deviations of the noise: about the most that it moves a parameter in an iteration,
@@ -172,18 +166,13 @@ def _trials(drive: Drive, steps: int) -> tuple[list[Trial], list[Trial]]:
 
 def _touches(trials: Sequence[Trial], steps: int) -> tuple[dict[tuple[int, int], Touch], dict[tuple[int, int], float]]:
     """Contacts within the horizon of any rollout: the earliest and deepest, and the share of rollouts."""
-    found: dict[tuple[int, int], Touch] = {}
-    counts: dict[tuple[int, int], int] = {}
-    for trial in trials:
-        for pair, touch in trial.touches.items():
-            if touch.first >= steps:
-                continue
-            counts[pair] = counts.get(pair, 0) + 1
-            known = found.setdefault(pair, dataclasses.replace(touch))
-            known.depth = max(known.depth, touch.depth)
-            if touch.first < known.first:
-                known.first, known.speed = touch.first, touch.speed
-    return found, {pair: count / len(trials) for pair, count in counts.items()}
+    every = [(pair, touch) for trial in trials for pair, touch in trial.touches.items() if touch.first < steps]
+    found, shares = {}, {}
+    for pair, alike in grouped(every, lambda each: each[0]).items():
+        earliest = min((touch for _, touch in alike), key=lambda touch: touch.first)
+        found[pair] = dataclasses.replace(earliest, depth=max(touch.depth for _, touch in alike))
+        shares[pair] = len(alike) / len(trials)
+    return found, shares
 
 
 def _pair(scene: Scene, aim: Aim, touches: dict[tuple[int, int], Touch]) -> tuple[str, str] | None:
@@ -202,7 +191,8 @@ def _load(scene: Scene, pair: tuple[str, str], touches: dict[tuple[int, int], To
     moving = {int(root) for root in host.body_rootid[host.geom_bodyid[geoms]] if root}
     mass = sum(float(host.body_subtreemass[root]) for root in moving)
     speed, weight = max(0.0, touches[geoms[0], geoms[1]].speed), mass * float(np.linalg.norm(host.opt.gravity))
-    return Load(effective_mass(scene, *pair), speed, weight, _half_size(host, geoms))
+    sizes = [float(host.geom_aabb[geom, 3:].min()) for geom in geoms if host.geom_rbound[geom] > 0]  # if not unbounded
+    return Load(effective_mass(scene, *pair), speed, weight, min(sizes, default=0.1))
 
 
 def _stiffnesses(load: Load, timestep: float) -> tuple[float, ...]:
@@ -210,9 +200,3 @@ def _stiffnesses(load: Load, timestep: float) -> tuple[float, ...]:
     high = load.mass * (RESOLVED / timestep) ** 2
     low = min(load.stiffness(SINKING * load.size), high / 10)
     return tuple(rounded(value, 1) for value in np.geomspace(low, high, STIFFNESSES).tolist())
-
-
-def _half_size(host: mujoco.MjModel, geoms: Sequence[int]) -> float:
-    """Least half size of those geoms that are not unbounded [m]."""
-    sizes = [float(host.geom_aabb[geom, 3:].min()) for geom in geoms if host.geom_rbound[geom] > 0]
-    return min(sizes, default=0.1)

@@ -16,11 +16,9 @@ from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.simulation.names import coordinates
 from mjx_study.table import number
 
-IMPORTED: Final = frozenset({"Path", "jnp", "replace", "study"})
-"""Names of the file's imports."""
+IMPORTED: Final = frozenset({"Path", "jnp", "replace", "study"})  # names of the file's imports
 _JOINT: Final = int(mujoco.mjtTrn.mjTRN_JOINT)
-MOST_LISTED: Final = 8
-"""Maximum number of contacts listed."""
+MOST_LISTED: Final = 8  # maximum number of contacts listed
 
 
 def function_name(mjcf: Path) -> str:

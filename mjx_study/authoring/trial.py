@@ -9,12 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_study.limits import LARGEST_COORDINATE
-from mjx_study.simulation.engine import quiet_engine
+from mjx_study.simulation.engine import approach_speed, quiet_engine
 
-SECONDS: Final = 2.0
-"""Longest test rollout [s]."""
-MOST_TRIED: Final = 2000
-"""Maximum number of steps of a test rollout."""
+SECONDS: Final = 2.0  # longest test rollout [s]
+MOST_TRIED: Final = 2000  # maximum number of steps of a test rollout
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,7 +93,7 @@ def run_trial(drive: Drive, change: Float[np.ndarray, "rows size"], steps: int) 
         for step in range(steps):
             data.ctrl[:] = drive.neutral if drive.at_start else drive.neutral + change[step % len(change)]
             mujoco.mj_step(host, data)
-            _note(host, data, step, touches, limits)
+            _note(data, step, touches, limits)
             mujoco.mj_kinematics(host, data)
             if not (np.abs([*data.qpos, *data.qvel]) < LARGEST_COORDINATE).all():
                 break
@@ -104,17 +102,12 @@ def run_trial(drive: Drive, change: Float[np.ndarray, "rows size"], steps: int) 
     return Trial(np.array(centres), np.array(qpos), touches, frozenset(limits))
 
 
-def _note(
-    host: mujoco.MjModel, data: mujoco.MjData, step: int, touches: dict[tuple[int, int], Touch], limits: set[int]
-) -> None:
-    elliptic, contacts = host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, data.contact
-    rows = zip(contacts.geom, contacts.dist, contacts.dim, contacts.efc_address, strict=True)
-    for geoms, distance, condim, address in rows:
-        if address < 0:
-            continue
-        approach = -float(np.mean(data.efc_vel[address : address + (1 if elliptic or condim == 1 else 2)]))
-        first, second = sorted(geoms.tolist())
-        touch = touches.setdefault((first, second), Touch(step, approach))
-        touch.depth = max(touch.depth, -float(distance))
+def _note(data: mujoco.MjData, step: int, touches: dict[tuple[int, int], Touch], limits: set[int]) -> None:
+    contacts = data.contact
+    for index in np.flatnonzero(contacts.efc_address >= 0).tolist():
+        first, second = sorted(contacts.geom[index].tolist())
+        if (first, second) not in touches:
+            touches[first, second] = Touch(step, approach_speed(data, contacts[index]))
+        touches[first, second].depth = max(touches[first, second].depth, -float(contacts.dist[index]))
     limited = data.efc_type[: data.nefc] == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)
     limits.update(data.efc_id[: data.nefc][limited].tolist())

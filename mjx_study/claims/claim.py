@@ -44,16 +44,6 @@ class Criterion:
         return holds if self.reversed is None else f"{holds}, reversed {_range(self.reversed)}"
 
 
-def above(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
-    """Criterion that a quantity is above a bound; reversed below another."""
-    return Criterion(quantity, (bound, math.inf), None if opposite is None else (-math.inf, opposite))
-
-
-def below(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
-    """Criterion that a quantity is below a bound; reversed above another."""
-    return Criterion(quantity, (-math.inf, bound), None if opposite is None else (opposite, math.inf))
-
-
 @dataclasses.dataclass(frozen=True)
 class Claim:
     """A statement that measurements can refute.
@@ -97,9 +87,9 @@ class Claim:
         return _digest(code_of(self.measure.__module__), versions, sorted(self.options.items()))
 
 
-def load_claims(modules: Mapping[str, ModuleType], path: Path = DEFINITIONS) -> dict[str, Claim]:
-    """Read claims by id, in the order of the file; the functions that measure them are in `modules`."""
-    definitions = tomllib.loads(path.read_text())
+def load_claims(modules: Mapping[str, ModuleType]) -> dict[str, Claim]:
+    """Read claims by id, in the order of `claims.toml`; the functions that measure them are in `modules`."""
+    definitions = tomllib.loads(DEFINITIONS.read_text())
     families, systems = definitions["families"], definitions["systems"]
 
     def claim(name: str, fields: dict[str, Any]) -> Claim:
@@ -109,11 +99,14 @@ def load_claims(modules: Mapping[str, ModuleType], path: Path = DEFINITIONS) -> 
             system: tuple(each for group in groups for each in families.get(group, [group]))
             for system, groups in chosen.items()
         }
+        ranges: dict[str, Any] = {
+            part: tuple(map(_bound, fields[part])) for part in ("holds", "reversed") if part in fields
+        }
         return Claim(
             name,
             fields["place"],
             fields["statement"],
-            _criterion(fields),
+            Criterion(fields["quantity"], **ranges),
             expanded,
             getattr(modules[module], function),
             fields.get("show", f"mjx-study claims --quick --only {name}"),
@@ -121,13 +114,6 @@ def load_claims(modules: Mapping[str, ModuleType], path: Path = DEFINITIONS) -> 
         )
 
     return {name: claim(name, fields) for name, fields in definitions["claims"].items()}
-
-
-def _criterion(fields: dict[str, Any]) -> Criterion:
-    if "within" in fields:
-        return Criterion(fields["quantity"], (fields["within"][0], fields["within"][1]))
-    make, bound = (above, fields["above"]) if "above" in fields else (below, fields["below"])
-    return make(fields["quantity"], *(_bound(each) for each in (bound, fields.get("reversed")) if each is not None))
 
 
 def _bound(value: float | str) -> float:

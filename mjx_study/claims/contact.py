@@ -12,12 +12,10 @@ from mjx_study.claims.theory import STIFFNESS
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.runtime import local_devices
 
-STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)
-"""Contact stiffnesses of the pusher [N/m]."""
+STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)  # contact stiffnesses of the pusher [N/m]
 CRITICAL: Final = 14.14
 """Critical damping of 1000 N/m between the pusher's bodies, of effective mass 0.05 kg [N s/m]."""
-HALF_STEP: Final = 0.0025
-"""Half of the pusher's timestep [s]."""
+HALF_STEP: Final = 0.0025  # half of the pusher's timestep [s]
 
 
 def study(lab: Laboratory, task: str, **changes: Any) -> xr.Dataset:

@@ -18,14 +18,12 @@ from mjx_study.options.configuration import StudyConfig
 
 SPANS: Final = {"ball_wall": (0.0, 1.5), "momentum_transfer": (0.0, 1.0)}
 """Range of angles that a descent may reach [rad]."""
-STARTS: Final = {"stiffness_schedule": 0.01, "sigma_schedule": 3.0}
-"""Initial factors of the schedules."""
+STARTS: Final = {"stiffness_schedule": 0.01, "sigma_schedule": 3.0}  # initial factors of the schedules
 CELL: Final = ("task", "timestep", "cone", "model", "sigma", "samples")
 """Singleton dimensions of a study with one cell."""
 GAMES: Final = 12
 """Number of descents per estimator on tennis, at any effort, with half the usual samples: they take the longest."""
-DIVERGED: Final = 10.0
-"""Cost of a diverged descent, as a multiple of the best one's gain."""
+DIVERGED: Final = 10.0  # cost of a diverged descent, as a multiple of the best one's gain
 
 
 def descents(lab: Laboratory, system: str, family: str, schedule: str | None = None) -> xr.Dataset:

@@ -28,7 +28,7 @@ from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.reference import FunctionObjective, smoothed
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.tasks import make_task
+from mjx_study.tasks import task_with_options
 from mjx_study.tasks.contact_grid import backward_grid, family_grid
 from mjx_study.tasks.task import Task
 
@@ -39,10 +39,8 @@ FAMILIES: Final = (
 """Columns of the verdict matrix."""
 REAL: Final = FAMILIES[1 : FAMILIES.index("mjcf")]
 """MJX contact families to compare; "mjcf" is for systems without contact."""
-TIMED: Final = 64
-"""Samples per device in a timed batch."""
-REPEATS: Final = 12
-"""Repetitions of a timing."""
+TIMED: Final = 64  # samples per device in a timed batch
+REPEATS: Final = 12  # repetitions of a timing
 RELAXATIONS: Final = {
     "smooth onset": ("smooth_onset", 1.0, None),
     "ten times softer": ("mujoco", 0.1, None),
@@ -188,10 +186,7 @@ class Laboratory:
         return run_study(config, folder, accept_versions=self._accept)
 
     def _task(self, name: str, timestep: float | None = None, onset: str = "none") -> Task:
-        task = THROWN[name]() if name in THROWN else make_task(name)
-        if timestep is not None:
-            horizon = round(task.horizon * task.scene.timestep / timestep)
-            task = make_task(name, timestep=timestep, horizon=horizon)
+        task = THROWN[name]() if name in THROWN else task_with_options(name, {"timestep": timestep})
         return task.replace(onset=onset)
 
     def _contact(

@@ -24,9 +24,9 @@ from mjx_study.identity import git_revision
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.law import installed
+from mjx_study.table import as_plain
 
-ALPHA: Final = 0.05
-"""Probability that any interval of a ledger misses its value."""
+ALPHA: Final = 0.05  # probability that any interval of a ledger misses its value
 
 
 def interval_of(statistic: Statistic, level: float) -> Range:
@@ -126,11 +126,8 @@ def _with_evidence(claim: Claim, kept: dict[str, Any], level: float) -> dict[str
         verdict = claim.criterion.verdict(interval)
         size = deciding_size(statistic, claim.criterion, level) if verdict == "undecided" else None
         numbers = {"estimate": statistic.estimate, "lower": interval[0], "upper": interval[1]}
-        evidence.append(
-            {"system": case["system"], "family": case["family"]}
-            | {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-            | {"verdict": verdict, "samples": statistic.samples, "of": statistic.of, "deciding": size}
-        )
+        found = {"verdict": verdict, "samples": statistic.samples, "of": statistic.of, "deciding": size}
+        evidence.append(as_plain({"system": case["system"], "family": case["family"], **numbers, **found}))
     return {
         "id": claim.id,
         "place": claim.place,

@@ -29,11 +29,9 @@ from mjx_study.reference import Heaviside, RelaxedHeaviside
 
 STIFFNESS: Final = 10_000.0
 """Contact stiffness of the landscapes, for families that take one [N/m]."""
-STEP, RAMP = "step", "ramp of 0.01 sigma"
-"""Analytic systems."""
+STEP, RAMP = "step", "ramp of 0.01 sigma"  # analytic systems
 Changes = Mapping[str, Any]
-NONE: Final[Changes] = MappingProxyType({})
-"""No changes of a landscape."""
+NONE: Final[Changes] = MappingProxyType({})  # no changes of a landscape
 
 
 def at(lab: Laboratory, system: str, family: str, stiffness: float = STIFFNESS, **changes: Any) -> Slopes:

@@ -57,5 +57,4 @@ def _thrown(name: str, body: str, rest: list[float], velocity: list[float]) -> T
     )
 
 
-THROWN: Final[dict[str, Callable[[], Task]]] = {"throw": throw, "box": box}
-"""Tasks of the ledger alone, by name."""
+THROWN: Final[dict[str, Callable[[], Task]]] = {"throw": throw, "box": box}  # tasks of the ledger alone, by name

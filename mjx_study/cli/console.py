@@ -19,8 +19,7 @@ from mjx_study.experiment.iteration import REASONS
 from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS
 from mjx_study.results.curves import curves_of, line_of
 from mjx_study.results.kind import findings_of
-from mjx_study.results.numbers import numbers_of
-from mjx_study.results.rows import Row, onset_of, remains, rows_of
+from mjx_study.results.rows import Row, numbers_of, onset_of, remains, rows_of
 from mjx_study.results.variables import (
     COLUMNS,
     COORDINATES,

@@ -7,11 +7,9 @@ from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, 
 from mjx_study.cli.options import configure_process, given_options, task_at_theta, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.options.configuration import OPTIONS
-from mjx_study.options.estimator_options import REQUIRED_OPTIONS
-from mjx_study.options.option import Option, OptionError
+from mjx_study.options.configuration import OPTIONS, REQUIRED_OPTIONS
+from mjx_study.options.option import Option, OptionError, reject_unused
 from mjx_study.options.parser import Parser
-from mjx_study.options.rules import reject_unused
 from mjx_study.table import explain
 
 UNEXERCISED = 3
@@ -122,8 +120,7 @@ def run(options: argparse.Namespace) -> int:
 def _run_mean(options: argparse.Namespace) -> int:
     from mjx_study.diagnose.means import ALONG_MEANS, check_mean, lines_of, path_of
     from mjx_study.diagnose.setting import setting_of
-    from mjx_study.experiment.resolution import make_estimators
-    from mjx_study.experiment.unused_options import reads_onset, reject_unread
+    from mjx_study.experiment.resolution import make_estimators, reads_onset, reject_unread
     from mjx_study.gradcheck import plan_gradcheck
 
     chosen = {name: option.default for name, option in MEAN_OPTIONS.items()} | given_options(options, *MEAN_OPTIONS)

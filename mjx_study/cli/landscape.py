@@ -4,8 +4,7 @@ import argparse
 
 from mjx_study.choices import REFERENCE
 from mjx_study.cli.options import given_options, study_fields
-from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
-from mjx_study.options.estimator_options import REQUIRED_OPTIONS
+from mjx_study.options.configuration import BUILDER_OPTIONS, REQUIRED_OPTIONS, StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.options.parser import MIDDLE, Parser
 from mjx_study.results.variables import LANDSCAPES, explained

@@ -20,9 +20,8 @@ from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.limits import LARGEST_COORDINATE, MOST_STEPS, check_count
 from mjx_study.options.configuration import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
-from mjx_study.options.option import OptionError
+from mjx_study.options.option import OptionError, reject_unused
 from mjx_study.options.parser import UsageError
-from mjx_study.options.rules import reject_unused
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.names import coordinates
@@ -96,8 +95,7 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
 
 
 def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
-    theta, policy = theta_and_policy(options)
-    found = {} if policy is None else policy.options
+    theta, found = theta_and_policy(options)
     for name in ("contact", "stiffness", "damping", "smoothing", "timestep", *BUILDER_OPTIONS):
         if getattr(options, name) is None:
             setattr(options, name, found.get(name))

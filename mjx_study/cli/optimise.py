@@ -65,23 +65,19 @@ def run(options: argparse.Namespace) -> int:
             fields["contact"] = (REFERENCE,)
         return plan_study(StudyConfig(**fields, kind="descents"), single=True)
 
+    def best_policies(document: dict[str, Any]) -> dict[str, Any]:
+        return {run["estimator"]: run["theta"][run["best_seed"]] for run in document["runs"]}
+
     offer = "a figure, the policies, and a run that can be resumed"
-    return run_one(options, planned, descents, descent_lines, offer, _save_policies, _best_policies)
-
-
-def _best_policies(document: dict[str, Any]) -> dict[str, Any]:
-    """Parameters at the end of each estimator's best descent."""
-    return {run["estimator"]: run["theta"][run["best_seed"]] for run in document["runs"]}
+    return run_one(options, planned, descents, descent_lines, offer, _save_policies, best_policies)
 
 
 def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
     from mjx_study.options.files import digest_of_json
 
     config, written = document["config"], []
-    kept = {
-        name: config[name]
-        for name in ("task", "stiffness", "damping", "smoothing", "cone", *BUILDER_OPTIONS, "network")
-    }
+    names = "task", "stiffness", "damping", "smoothing", "cone", *BUILDER_OPTIONS, "network"
+    kept = {name: config[name] for name in names}
     kept |= {"contact": None if config["contact"] == REFERENCE else config["contact"]}
     kept |= {"timestep": config["timestep"][0] if config["timestep"] else None}
     for run in document["runs"]:

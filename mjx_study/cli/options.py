@@ -14,7 +14,6 @@ from mjx_study.options.option import OptionError, flag_of
 from mjx_study.options.parser import TASK_OPTIONS, UsageError
 
 if TYPE_CHECKING:
-    import mjx_study.options.files
     import mjx_study.tasks.task
 
 
@@ -72,22 +71,21 @@ def task_at_theta(options: argparse.Namespace) -> "mjx_study.tasks.task.Task":
     return at_theta(task, theta_and_policy(options)[0])
 
 
-def theta_and_policy(
-    options: argparse.Namespace,
-) -> "tuple[tuple[float, ...] | None, mjx_study.options.files.SavedPolicy | None]":
-    """Return the parameters given by `--theta`, and the policy file that holds them, which must be for the task."""
+def theta_and_policy(options: argparse.Namespace) -> tuple[tuple[float, ...] | None, dict[str, Any]]:
+    """Return the parameters given by `--theta`, and what `read_theta` finds with them in a policy's file, which must be
+    for the task."""
     from mjx_study.options.files import read_theta
 
     if options.theta is None:
-        return None, None
+        return None, {}
     try:
         [float(part) for part in options.theta.split(",")]
     except ValueError:
         theta, policy = read_theta(Path(options.theta))
     else:
-        return OPTIONS["theta"].parse(options.theta), None
-    if policy is not None and policy.task != options.task:
-        raise ValueError(f"{options.theta} is a policy of {policy.task}, not of {options.task}")
+        return OPTIONS["theta"].parse(options.theta), {}
+    if policy.get("task", options.task) != options.task:
+        raise ValueError(f"{options.theta} is a policy of {policy['task']}, not of {options.task}")
     return theta, policy
 
 

@@ -18,13 +18,12 @@ from mjx_study.execution.cluster import connected
 from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.lost import all_lost
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.experiment.study import StudyPlan
+from mjx_study.experiment.study import StudyError, StudyPlan
 from mjx_study.options.parser import UsageError
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.results.kind import findings_of
-from mjx_study.results.numbers import meanings_of, numbers_of
+from mjx_study.results.rows import meanings_of, numbers_of
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.table import as_plain, digits_to_tell_apart, format_table, size
@@ -164,7 +163,6 @@ def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> 
 
 
 def _meanings(dataset: xr.Dataset, titles: Iterable[str]) -> list[str]:
-    """What the columns of a table mean."""
     found = "; ".join(f"{name}: {meaning}" for name, meaning in meanings_of(dataset).items() if name in titles)
     seeds = ", of several seeds medians" if dataset.sizes.get("seed", 1) > 1 else ""
     return [*textwrap.wrap(f"{found}. After ±: a standard error; in brackets: a confidence interval{seeds}.", 140), ""]

@@ -1,7 +1,6 @@
 """mjx-study tasks."""
 
 import argparse
-from typing import Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.cli.options import configure_process, usage_errors
@@ -16,18 +15,14 @@ def add(command: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    lines = [f"{name:<25} {description}" for name, description in TASK_DESCRIPTIONS.items()]
-    return print_report(options, {"tasks": _rows(options)} if options.json else {}, lines)
+    lines, rows = [f"{name:<25} {description}" for name, description in TASK_DESCRIPTIONS.items()], []
+    if options.json:
+        from mjx_study.tasks import make_task
 
-
-def _rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    from mjx_study.tasks import make_task
-
-    with usage_errors():
-        configure_process(options)
-    tasks = [make_task(name) for name in TASK_DESCRIPTIONS]
-    return [
-        {"name": task.name, "params": task.policy.num_params, "horizon": task.horizon, "sigma": task.sigma}
-        | {"effective_mass": task.effective_mass if task.contact_pair else None, "description": task.description}
-        for task in tasks
-    ]
+        with usage_errors():
+            configure_process(options)
+        for task in map(make_task, TASK_DESCRIPTIONS):
+            mass = task.effective_mass if task.contact_pair else None
+            row = {"name": task.name, "params": task.policy.num_params, "horizon": task.horizon, "sigma": task.sigma}
+            rows.append(row | {"effective_mass": mass, "description": task.description})
+    return print_report(options, {"tasks": rows}, lines)

@@ -9,12 +9,10 @@ from mjx_study.diagnose.run import Diagnosis, enough, round_up
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
 from mjx_study.table import number, percent
 
-MIN_SAMPLES: Final = 100
-"""Number of samples below which the page warns."""
+MIN_SAMPLES: Final = 100  # number of samples below which the page warns
 SMOOTH_SHARE: Final = 0.01
 """Share of the approach speed lost in the first step below which force counts as setting in without a jump."""
-WIDTH_RATIO: Final = 3.0
-"""Recommended width of the impedance's rise, as a multiple of a step's travel."""
+WIDTH_RATIO: Final = 3.0  # recommended width of the impedance's rise, as a multiple of a step's travel
 
 Advice = tuple[str, str]
 """A recommendation, and options of `compare` that demonstrate it."""

@@ -21,27 +21,22 @@ from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.mean_check import NODES, TOLERANCE, Circulation, circulations
 from estimators.registry import label_of
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.experiment.resolution import check_estimators, direction_of
+from mjx_study.experiment.resolution import CORRECTED, check_estimators, direction_of, reads_onset
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches
 from mjx_study.experiment.study import StudyPlan, estimators_of
-from mjx_study.experiment.unused_options import CORRECTED, reads_onset
 from mjx_study.objective import Simulator, chunk_for
-from mjx_study.options.rules import check_span
+from mjx_study.options.option import check_span
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import local_devices
 from mjx_study.table import Column, as_plain, percent, tabulate
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
-HALF_LENGTH: Final = 2.0
-"""Length of the path to either side of theta, in standard deviations of noise on theta."""
-FEEDBACK: Final = 0.02
-"""The same for noise on the controls, in the unit of theta."""
-ALONG_MEANS: Final = "means"
-"""Value of `direction` for paths along the estimators' means, see `along_means`."""
+HALF_LENGTH: Final = 2.0  # length of the path to either side of theta, in standard deviations of noise on theta
+FEEDBACK: Final = 0.02  # the same for noise on the controls, in the unit of theta
+ALONG_MEANS: Final = "means"  # value of `direction` for paths along the estimators' means, see `along_means`
 MAX_PATHS: Final = 3
-MIN_SHARE: Final = 1e-3
-"""Smallest share of a mean orthogonal to the others that warrants a path along it."""
+MIN_SHARE: Final = 1e-3  # smallest share of a mean orthogonal to the others that warrants a path along it
 
 Nodes = Callable[[int, int], None]
 """Called before each node of the paths with the number of nodes done, and of all."""

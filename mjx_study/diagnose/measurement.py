@@ -30,23 +30,16 @@ from mjx_study.simulation.scene import num_constraint_rows
 from mjx_study.tasks.task import Task
 
 ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
-SAMPLES: Final = 500
-"""Samples per batch, if time allows."""
-BUDGET_SECONDS: Final = 30.0
-"""Time for all batches, compilation excluded [s]."""
+SAMPLES: Final = 500  # samples per batch, if time allows
+BUDGET_SECONDS: Final = 30.0  # time for all batches, compilation excluded [s]
 LARGE_CHUNK: Final = 8
 """Samples per program call on a CPU for large models: a call takes the time of all of them, however few are
 requested. Small ones share the programs of studies."""
-SMALL_MODEL: Final = (8, 32)
-"""Maximum numbers of degrees of freedom and constraint rows of a small model."""
-RESOLVED_SE: Final = 2.0
-"""Standard errors beyond which a gradient is distinguishable from 0."""
-INTERVAL_SE: Final = 1.96
-"""Half-width of a 95 % interval in standard errors."""
-MOST_SAMPLES: Final = 16 * SAMPLES
-"""Number of samples beyond which no more are drawn without being asked for."""
-TARGET_ERROR: Final = 0.1
-"""Relative error for which the page states a number of samples."""
+SMALL_MODEL: Final = (8, 32)  # maximum numbers of degrees of freedom and constraint rows of a small model
+RESOLVED_SE: Final = 2.0  # standard errors beyond which a gradient is distinguishable from 0
+INTERVAL_SE: Final = 1.96  # half-width of a 95 % interval in standard errors
+MOST_SAMPLES: Final = 16 * SAMPLES  # number of samples beyond which no more are drawn without being asked for
+TARGET_ERROR: Final = 0.1  # relative error for which the page states a number of samples
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,13 +127,10 @@ class Measurement:
     @property
     def _slope(self) -> tuple[float, float]:
         """Slope along a path and its standard error, from those of the integrated mean and of the gap."""
-        errors = [(math.hypot(each.off_error, math.sqrt(each.variance / self.samples)), each) for each in self._derived]
+        checked = [each for each in self.estimators if each.paths]
+        errors = [(math.hypot(each.off_error, math.sqrt(each.variance / self.samples)), each) for each in checked]
         error, known = min(errors, key=lambda each: each[0], default=(math.inf, None))
         return (known.slope, error) if known else (0.0, error)
-
-    @property
-    def _derived(self) -> list[Measured]:
-        return [each for each in self.estimators if each.paths]
 
     @property
     def norm(self) -> float:
@@ -166,10 +156,6 @@ class Measurement:
         resolving = [] if self.resolved or not self.norm else [(RESOLVED_SE * self.norm_error / self.norm) ** 2]
         rivals = [each for each in self.estimators if each.error(1.0, bias=0.0) <= self.best.error(1.0)]
         return resolving + [each.more_samples() for each in rivals if each.verdict == "undecided"]
-
-    def time_of(self, samples: float) -> float:
-        """Time of as many samples and checks of the means with them [s]."""
-        return self.seconds * samples / self.samples
 
     @property
     def samples_needed(self) -> float:

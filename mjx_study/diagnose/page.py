@@ -22,10 +22,8 @@ TERM: Final = "; _onset: with a term for contact that begins or ends"
 UNKNOWN: Final = "unknown"
 NOT_JUDGED: Final = "not judged"
 UNJUDGED: Final = "  not judged: means are judged by shares of the gradient, which is not distinguishable from 0"
-MAX_ERROR: Final = 100.0
-"""Upper end beyond which the interval of a relative error is uninformative."""
-MAX_SHOWN: Final = 6
-"""Number of contacts listed in the text, the least resolved ones."""
+MAX_ERROR: Final = 100.0  # upper end beyond which the interval of a relative error is uninformative
+MAX_SHOWN: Final = 6  # number of contacts listed in the text, the least resolved ones
 
 
 def document_of(found: Diagnosis) -> dict[str, Any]:

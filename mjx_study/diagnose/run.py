@@ -17,12 +17,9 @@ from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
-STATES: Final = 2
-"""Number of states in the gradient check."""
-PARTS: Final = ("rollout without noise", "derivatives of steps", "estimators")
-"""Names of the parts in progress."""
-ONE_DIGIT_UNCERTAINTY: Final = 0.5
-"""Relative standard error beyond which an error is shown with one digit."""
+STATES: Final = 2  # number of states in the gradient check
+PARTS: Final = ("rollout without noise", "derivatives of steps", "estimators")  # names of the parts in progress
+ONE_DIGIT_UNCERTAINTY: Final = 0.5  # relative standard error beyond which an error is shown with one digit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,11 +51,6 @@ class Diagnosis(Measurement):
         return next((finding.verdict for finding in self.derivatives.findings if finding.fails), "wrong")
 
     @property
-    def scale(self) -> float:
-        """Norm that errors are relative to: the gradient's if it is distinguishable from 0, else 1."""
-        return self.norm if self.resolved else 1.0
-
-    @property
     def scale_error(self) -> float:
         return self.norm_error / self.norm if self.resolved else 0.0
 
@@ -69,7 +61,7 @@ class Diagnosis(Measurement):
 
     def shown(self, error: float) -> float:
         """An error [gradient] in `unit`."""
-        return error / self.scale * (100 if self.resolved else 1)
+        return error / self.norm * 100 if self.resolved else error
 
     def error_text(self, error: float, uncertainty: float) -> str:
         """Format an error to two significant digits, or to one if its relative standard error is large."""
@@ -94,7 +86,7 @@ def round_up(number: float) -> str:
 def enough(found: Measurement, factor: float) -> str:
     """So many times the samples drawn, as an option, and how long they take here."""
     samples = round_up(factor * found.samples)
-    seconds = found.time_of(factor * found.samples)
+    seconds = factor * found.seconds
     time = f"{seconds / 60:,.0f} minutes" if seconds > 120 else f"{max(seconds, 1):.0f} s"
     return f"--samples {samples.replace(',', '')} ({time} here)"
 

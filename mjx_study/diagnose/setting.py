@@ -15,14 +15,12 @@ from mjx_study.choices import is_file
 from mjx_study.objective import compiled_rollout
 from mjx_study.simulation.contact import has_mujoco_law, stable, stiffness_from_solref
 from mjx_study.simulation.contact_pair import geom_label
-from mjx_study.simulation.engine import engine_model
+from mjx_study.simulation.engine import approach_speed, engine_model
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
-EVENTS: Final = 50
-"""Number of rollouts with noise in which contacts are counted under a law other than MuJoCo's."""
-FASTEST: Final = 10.0
-"""Closing speed up to which contacts are found under a law that acts before touch [m/s]."""
+EVENTS: Final = 50  # number of rollouts with noise in which contacts are counted under a law other than MuJoCo's
+FASTEST: Final = 10.0  # closing speed up to which contacts are found under a law that acts before touch [m/s]
 FOREIGN: Final = {"damping": None, "stiffness": None, "travel": None, "impedance": None, "jump": 0.0, "stable": True}
 """What a contact under a law other than MuJoCo's has in place of MuJoCo's numbers."""
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -158,13 +156,6 @@ def _fastest(host: mujoco.MjModel, data: mujoco.MjData) -> Float[np.ndarray, " c
     return found
 
 
-def _rows(host: mujoco.MjModel, data: mujoco.MjData, contact: Any) -> Float[np.ndarray, " rows"]:
-    """Velocities of the constraint rows of a contact that resist its normal motion [m/s]; none without rows."""
-    pyramid = contact.dim > 1 and host.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    first = contact.efc_address
-    return data.efc_vel[first : first + (2 * (contact.dim - 1) if pyramid else 1)] if first >= 0 else np.zeros(0)
-
-
 def _used(host: mujoco.MjModel, solref: Float[np.ndarray, "2"], timestep: float) -> Float[np.ndarray, "2"]:
     """A solref with the time constant that MuJoCo uses in place of one too short."""
     if solref[0] > 0 and not host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
@@ -176,8 +167,7 @@ def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: floa
     """Describe a contact in the engine's data that has just begun."""
     solref = _used(host, np.array(contact.solref), timestep)
     k, b = stiffness_from_solref(solref.tolist(), effective_mass=1.0)
-    rows = _rows(host, data, contact)
-    speed = -float(np.mean(rows)) if len(rows) else 0.0
+    speed = approach_speed(data, contact)
     return ContactSummary(
         pair=" and ".join(geom_label(host, int(geom)) for geom in contact.geom),
         time=time,

@@ -5,8 +5,7 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future
 from typing import Any
 
-from mjx_study.experiment.checkpoint import Arrays, Checkpoint
-from mjx_study.experiment.study import Computation, StudyPlan, Work
+from mjx_study.experiment.study import Arrays, Checkpoint, Computation, StudyPlan, Work
 from mjx_study.progress import Progress
 
 

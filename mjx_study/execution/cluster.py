@@ -5,6 +5,7 @@ single, known unit. Workers keep compiled programs by the content of the study, 
 compiled its program, if there is one.
 """
 
+import dataclasses
 import functools
 import logging
 import math
@@ -23,9 +24,8 @@ from typing import Any, Final
 
 from mjx_study.disk import temporary_folder
 from mjx_study.execution.cells import Cells
-from mjx_study.experiment.checkpoint import Arrays, Checkpoint, StudyError
 from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.study import Computation, StudyPlan
+from mjx_study.experiment.study import Arrays, Checkpoint, Computation, StudyError, StudyPlan
 from mjx_study.identity import differences, versions
 from mjx_study.runtime import available_cores, configure, precision
 from mjx_study.watchdog import watch
@@ -247,7 +247,7 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Computation]:
     ours = versions(), plan.contents
     if different := differences(*({**one, **other} for one, other in (client, ours))):
         raise WorkerRefusedError(f"the worker {get_worker().address} is refused: {different} ('there' is the client)")
-    plan = plan.with_chunk(chunk)
+    plan = dataclasses.replace(plan, chunk_size=chunk)
     return plan, plan.kind.computation(plan)
 
 

@@ -5,9 +5,9 @@ the configuration alone, not on which cells were computed before it or by whom. 
 separately; everything else is traced.
 """
 
+import dataclasses
 import json
 import time
-from collections.abc import Generator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -18,9 +18,8 @@ import xarray as xr
 from estimators.user_inputs import observing
 from mjx_study.execution.cells import Cells, Executor, compute_here
 from mjx_study.execution.cluster import compute_there, connected
-from mjx_study.experiment.checkpoint import Arrays
 from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.study import StudyPlan
+from mjx_study.experiment.study import Arrays, StudyPlan
 from mjx_study.identity import differences, versions
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.progress import Progress, silent
@@ -76,7 +75,7 @@ def run_study(
         client = stack.enter_context(connected(cluster)) if isinstance(cluster, str) else cluster
         stack.enter_context(observing(*plan.user_modules))
         executor = compute_here if client is None else partial(compute_there, client)
-        plan = plan.with_chunk(store.chunk_size)
+        plan = dataclasses.replace(plan, chunk_size=store.chunk_size)
         return _in_folder(plan, store, progress, executor, keep_going=keep_going)
 
 
@@ -103,19 +102,20 @@ def _in_folder(
     unwritten: OSError | None = None
     while missing := [index for index in store.missing if index not in held and index not in failed]:
         cells.done, claimed = total - len(missing), False
-        for index, arrays in _claimed(store, missing, cells, executor):
-            claimed = True
-            if isinstance(arrays, str):
-                failed[index] = arrays
-                continue
-            computed += 1
-            try:
-                store.record(plan.seen)
-                store.write(index, arrays)
-            except OSError as error:
-                if not keep_going:
-                    raise
-                unwritten, held[index] = error, (arrays, store.document["versions"])
+        with store.claims() as claim:  # of cells that no other process has claimed or written
+            for index, arrays in executor(cells, (each for each in missing if claim(each) and not store.has(each))):
+                claimed = True
+                if isinstance(arrays, str):
+                    failed[index] = arrays
+                    continue
+                computed += 1
+                try:
+                    store.record(plan.seen)
+                    store.write(index, arrays)
+                except OSError as error:
+                    if not keep_going:
+                        raise
+                    unwritten, held[index] = error, (arrays, store.document["versions"])
         if not claimed:
             progress(cells.done, total, "another process computes the rest")
             time.sleep(WAIT_SECONDS)
@@ -134,11 +134,3 @@ def _in_folder(
     if failed:
         dataset.attrs["failed_cells"] = json.dumps({cells.label(index): why for index, why in sorted(failed.items())})
     return dataset.assign_attrs(computed_cells=computed)
-
-
-def _claimed(
-    store: Store, missing: Sequence[int], cells: Cells, executor: Executor
-) -> Generator[tuple[int, Arrays | str]]:
-    """Compute those cells that no other process has claimed."""
-    with store.claims() as claim:
-        yield from executor(cells, (index for index in missing if claim(index) and not store.has(index)))

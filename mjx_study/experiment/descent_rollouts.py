@@ -87,25 +87,22 @@ class Backend:
         """Return an iteration of all seeds under one contact model, by index; compiled once for all contact models."""
         if (simulator := self.simulator) is not None:
             if estimator not in self._iterations:
-                name, size = self.recipe.optimizer, self._padded if self._in_turn else self.samples
+                name, in_turn = self.recipe.optimizer, self._in_turn
+                size = self._padded if in_turn else self.samples
 
-                def in_turn(contact, sigma, state: Descent, keys, rates, samples):
-                    objective = TracedObjective(simulator, contact, sigma, batched=False, samples=samples)
+                def all_seeds(contact, sigma, state: Descent, keys, rates, samples=None):
+                    objective = TracedObjective(simulator, contact, sigma, batched=not in_turn, samples=samples)
 
                     def one_seed(state, key):
                         drawn = draw(estimator.needs, objective, state.theta, key, size)
                         return advance_one(state, drawn, estimator, optimizer_of(name, *rates), samples)
 
-                    return jax.lax.map(lambda each: if_going(one_seed, *each), (state, keys))
-
-                def all_seeds(contact, sigma, state: Descent, keys, rates):
-                    objective = TracedObjective(simulator, contact, sigma)
-                    batches = partial(draw, estimator.needs, objective, num_samples=size)
-                    drawn = jax.vmap(batches)(jnp.asarray(state.theta), keys)
-                    return advance(state, drawn, estimator, optimizer_of(name, *rates))
+                    if in_turn:
+                        return jax.lax.map(lambda each: if_going(one_seed, *each), (state, keys))
+                    return jax.vmap(one_seed)(state, keys)
 
                 made_of = "descent", estimator, name, self.task, size, simulator.chunk_size
-                self._iterations[estimator] = Compiled(in_turn if self._in_turn else all_seeds, *made_of)
+                self._iterations[estimator] = Compiled(all_seeds, *made_of)
             simulated = self._iterations[estimator]
             return lambda *arguments: simulated(*self._on_device(model, *arguments))
 

@@ -22,20 +22,21 @@ from jaxtyping import Array, Float, Int, Key
 
 from estimators import Estimator
 from mjx_study.compiled import Builds
-from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.descent_rollouts import Backend
-from mjx_study.experiment.iteration import (
-    Descent,
-    Record,
-    begin,
-    going,
-    make_optimizer,
-    schedule_factors,
-)
+from mjx_study.experiment.iteration import Descent, Record, begin, going, make_optimizer, schedule_factors
 from mjx_study.experiment.memory import check_memory
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
-from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
+from mjx_study.experiment.study import (
+    Arrays,
+    Checkpoint,
+    Computation,
+    StudyCell,
+    StudyKind,
+    StudyPlan,
+    done,
+    estimators_of,
+)
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.results.findings import descent_findings
@@ -88,7 +89,7 @@ class Descents(StudyKind):
             raise OptionError("sigma_schedule", f"changes sigma, and {fixed[0]} holds for one: omit one of them")
         history = HISTORY_NUMBERS * config.seeds * recipe.iterations
         check_memory(group.task, chosen, config.seeds * cell.samples, other=history)
-        check_memory(group.task, (), plan.settings.evaluation_samples)
+        check_memory(group.task, (), plan.config.settings.evaluation_samples)
 
     def batches_at_once(self, config: StudyConfig) -> int:
         return 1
@@ -102,7 +103,7 @@ class Descents(StudyKind):
     def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
         task, chosen = plan.task_of(cell), estimators_of(plan, cell)
         batches = [rollouts_of(each.needs, cell.samples, task) for each in chosen]
-        evaluations = (plan.config.seeds * len(chosen) + 1) * plan.settings.evaluation_samples
+        evaluations = (plan.config.seeds * len(chosen) + 1) * plan.config.settings.evaluation_samples
         iterations = plan.groups[cell.group].descent.iterations
         return plan.config.seeds * iterations * np.sum(batches, axis=0) + [evaluations, 0]
 
@@ -219,7 +220,7 @@ class _Run:
         columns = [kept(f"history_{self.index}_{name}", each, "f") for name in HISTORY]
         whole = [np.concatenate([rows, leaf[len(rows) :]]) for rows, leaf in zip(state, leaves, strict=True)]
         self.state = structure.unflatten(whole)
-        self.records += [Record(*row) for row in zip(*columns, strict=True)]
+        self.records += [Record(zip(HISTORY, row, strict=True)) for row in zip(*columns, strict=True)]
         self.seconds += map(float, kept(f"seconds_{self.index}", (length,), "f"))
 
     def descend(self) -> None:
@@ -247,7 +248,7 @@ class _Run:
         """Report the progress of all estimators, and their costs so far."""
         backend = self.backend
         with backend.saving:
-            last = np.asarray(self.records[-1].cost)
+            last = np.asarray(self.records[-1]["cost"])
             last = last[np.isfinite(last)]
             backend.costs[self.estimator.name] = done, float(np.mean(last)) if len(last) else math.nan
             total = len(backend.costs) * backend.recipe.iterations
@@ -277,9 +278,7 @@ class _Run:
 
     def _history(self) -> dict[str, Float[np.ndarray, "iterations seeds"]]:
         shape = len(self.records), self.backend.seeds
-        return {
-            name: np.array([getattr(record, name) for record in self.records], float).reshape(shape) for name in HISTORY
-        }
+        return {name: np.array([record[name] for record in self.records], float).reshape(shape) for name in HISTORY}
 
     def numbers(self) -> dict[str, np.ndarray]:
         """Numbers of the run, once it has ended."""

@@ -23,41 +23,23 @@ from estimators import ORACLES, Evaluation, GradientEstimate
 from estimators.merged_samples import MAX_THINNED, moments_of
 from estimators.statistics import merged_estimates
 from mjx_study.compiled import Builds, type_of
-from mjx_study.experiment.checkpoint import Arrays, Checkpoint
-from mjx_study.experiment.gradient_numbers import (
-    MOST_KEPT,
-    cell_numbers,
-    estimate_numbers,
-    padded,
-    samples_of_parts,
-    seed_numbers,
-)
-from mjx_study.experiment.memory import (
-    AT_ONCE,
-    BLOCK_BYTES,
-    LARGEST_BLOCK,
-    blocks_take,
-    bytes_of_moments,
-    bytes_per_sample,
-    check_batches,
-)
+from mjx_study.experiment import gradient_numbers, memory
+from mjx_study.experiment.gradient_numbers import MOST_KEPT, cell_numbers, estimate_numbers, seed_numbers
 from mjx_study.experiment.merged_samples import REFERENCE_UNIT, Blocks, pack
-from mjx_study.experiment.reference_gradient import (
-    CANDIDATES,
-    averaged,
-    most_parts,
-    reference_of,
-    soft_gradient,
+from mjx_study.experiment.reference_gradient import CANDIDATES, averaged, most_parts, reference_of, soft_gradient
+from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, rows_of_keys, sample_keys
+from mjx_study.experiment.study import (
+    Arrays,
+    Checkpoint,
+    Computation,
+    Result,
+    StudyCell,
+    StudyKind,
+    StudyPlan,
+    Work,
+    done,
+    estimators_of,
 )
-from mjx_study.experiment.sampling import (
-    Objectives,
-    cell_keys,
-    draw_batches,
-    rollouts_of,
-    rows_of_keys,
-    sample_keys,
-)
-from mjx_study.experiment.study import Computation, Result, StudyCell, StudyKind, StudyPlan, Work, done, estimators_of
 from mjx_study.experiment.tally import Tally
 from mjx_study.limits import MOST_GIB
 from mjx_study.objective import BlankObjective, MjxObjective
@@ -69,7 +51,7 @@ from mjx_study.results.rows import rows_of
 from mjx_study.results.variables import GRADIENTS, ONSETS
 from mjx_study.tasks.task import Task
 
-PILOT: Final = LARGEST_BLOCK
+PILOT: Final = memory.LARGEST_BLOCK
 """Maximum number of samples of the first batch used to select among the reference's control variates."""
 
 
@@ -89,15 +71,17 @@ class Gradients(StudyKind):
         need whole batches."""
         whole = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
         if whole and plan.config.block_size is not None:
-            reason = f"splits batches, and {', '.join(whole)} must have whole ones: omit it; {blocks_take(whole)}"
+            reason = (
+                f"splits batches, and {', '.join(whole)} must have whole ones: omit it; {memory.blocks_take(whole)}"
+            )
             raise OptionError("block_size", reason)
-        check_batches(plan.memory, whole)
+        memory.check_batches(plan.memory, whole)
 
     def memory(self, plan: StudyPlan, cell: StudyCell) -> int:
         """Memory held at once [bytes]: batches and statistics, or a block, and moments until a batch is complete."""
         if (blocks := blocks_of(plan, cell)) == 1:
             return plan.memory_of_seed(cell) * seeds_together(plan, cell)
-        moments = bytes_of_moments(estimators_of(plan, cell), plan.task_of(cell).policy.num_params)
+        moments = memory.bytes_of_moments(estimators_of(plan, cell), plan.task_of(cell).policy.num_params)
         kept = plan.config.seeds + math.ceil(math.log2(blocks))
         return block_of(plan, cell) * _bytes_in_block(plan, cell) + 2 * kept * moments
 
@@ -109,10 +93,10 @@ class Gradients(StudyKind):
     def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
         candidates = 0 if cell.model.analytic else CANDIDATES
         batches = plan.config.seeds * rollouts_of(plan.oracles, cell.samples, plan.task_of(cell))
-        return batches + [2 * plan.settings.reference_samples + candidates, candidates]
+        return batches + [2 * plan.config.settings.reference_samples + candidates, candidates]
 
     def more_rollouts(self, plan: StudyPlan, cell: StudyCell) -> int:
-        pairs = plan.settings.reference_samples
+        pairs = plan.config.settings.reference_samples
         return 2 * pairs * (_parts(plan, plan.task_of(cell)) - 1)
 
     def computation(self, plan: StudyPlan) -> "GradientComputation":
@@ -162,8 +146,8 @@ def block_of(plan: StudyPlan, cell: StudyCell) -> int:
     fits = plan.memory_of_seed(cell) <= MOST_GIB * 2**30
     if fits or not all(each.mergeable for each in estimators_of(plan, cell)):
         return cell.samples
-    even = int(BLOCK_BYTES / _bytes_in_block(plan, cell)) // 2 * 2
-    return min(cell.samples, LARGEST_BLOCK, max(2, even))
+    even = int(memory.BLOCK_BYTES / _bytes_in_block(plan, cell)) // 2 * 2
+    return min(cell.samples, memory.LARGEST_BLOCK, max(2, even))
 
 
 def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
@@ -173,13 +157,13 @@ def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
 
 def _bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
     """Memory per sample of a block, statistics included [bytes]."""
-    return bytes_per_sample(plan.task_of(cell), plan.oracles, 2 * len(plan.config.estimators), draws=0)
+    return memory.bytes_per_sample(plan.task_of(cell), plan.oracles, 2 * len(plan.config.estimators), draws=0)
 
 
 def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
     """Number of seeds that a cell draws at once: as many as fit into memory, in equal groups."""
     batches = plan.config.seeds
-    fitting = max(1, int(AT_ONCE[jax.default_backend()] / plan.memory_of_seed(cell)))
+    fitting = max(1, int(memory.AT_ONCE[jax.default_backend()] / plan.memory_of_seed(cell)))
     return math.ceil(batches / math.ceil(batches / fitting))
 
 
@@ -218,13 +202,11 @@ class GradientComputation(Computation):
     def compute(self, cell: StudyCell, unit: int, checkpoint: Checkpoint) -> Future[Arrays]:
         if blocks_of(self._plan, cell) == 1:
             return self._whole(cell)
-        return done(self._reference_unit(cell) if unit == REFERENCE_UNIT else self._block(cell, unit))
-
-    def _reference_unit(self, cell: StudyCell) -> Arrays:
-        objective = self._objective(cell)
-        keys = sample_keys(self._keys["order"][0][0], 0, min(cell.samples, PILOT))
+        if unit != REFERENCE_UNIT:
+            return done(self._block(cell, unit))
+        objective, keys = self._objective(cell), sample_keys(self._keys["order"][0][0], 0, min(cell.samples, PILOT))
         pilot = objective.evaluate(self._plan.task_of(cell).theta, keys)
-        return {"reference": np.asarray(self._reference(cell, objective, pilot)[0].per_sample)}
+        return done({"reference": np.asarray(self._reference(cell, objective, pilot)[0].per_sample)})
 
     def _block(self, cell: StudyCell, unit: int) -> Arrays:
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
@@ -238,7 +220,7 @@ class GradientComputation(Computation):
         )
         batches = jax.tree.map(lambda leaf: leaf[0], drawn)
         summary: dict[str, Any] = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
-        for number, rows in enumerate(jax.device_get(samples_of_parts(batches, chosen))):
+        for number, rows in enumerate(jax.device_get(gradient_numbers.samples_of_parts(batches, chosen))):
             summary |= {f"{number}.{part}": each for part, each in enumerate(moments_of(rows, first, every))}
         return pack(summary)
 
@@ -267,7 +249,7 @@ class GradientComputation(Computation):
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
         tests, chosen = keys["tests"], estimators_of(self._plan, cell)
         together, each = seeds_together(self._plan, cell), self._seeds_of_statistics(cell)
-        pad = partial(padded, size=self._plan.padded_samples(cell))
+        pad = partial(gradient_numbers.padded, size=self._plan.padded_samples(cell))
         reference: GradientEstimate | None = None
         pairs = 0
         parts: list[Future[Any]] = []
@@ -375,4 +357,4 @@ class GradientComputation(Computation):
 
 def _parts(plan: StudyPlan, task: Task) -> int:
     """Maximum number of references that are averaged: one if the configuration sets their pairs."""
-    return 1 if plan.config.reference_samples is not None else most_parts(task, plan.settings.reference_samples)
+    return 1 if plan.config.reference_samples is not None else most_parts(task, plan.config.settings.reference_samples)

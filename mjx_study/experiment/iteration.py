@@ -20,6 +20,9 @@ from estimators.pytree import register_pytree
 from mjx_study.experiment.gradient_numbers import estimate_of
 
 AnyArray = Array | np.ndarray
+Record = dict[str, Any]
+"""Arrays of `variables.HISTORY` in one iteration, by seed; NaN once a seed has stopped. alpha is NaN for estimators
+with a single batch, and the residual 0 for an analytic system."""
 
 MOST_COST_RATIO: Final = 1e6
 """Ratio of the mean cost to the size of the first one beyond which a run counts as diverged."""
@@ -47,22 +50,6 @@ class Descent:
     optimizer: Any
     reason: Int[AnyArray, "*seeds"]
     first_cost: Float[AnyArray, "*seeds"]
-
-
-@register_pytree
-@dataclasses.dataclass(frozen=True)
-class Record:
-    """Variables of one iteration for each seed, see `variables.DESCENTS`; NaN once a seed has stopped.
-
-    alpha is NaN for estimators with a single batch, and the residual 0 for an analytic system.
-    """
-
-    cost: Float[AnyArray, "*seeds"]
-    gradient_norm: Float[AnyArray, "*seeds"]
-    variance: Float[AnyArray, "*seeds"]
-    alpha: Float[AnyArray, "*seeds"]
-    nonfinite: Float[AnyArray, "*seeds"]
-    residual: Float[AnyArray, "*seeds"]
 
 
 def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.GradientTransformation:
@@ -186,14 +173,14 @@ def advance_one(
         first_cost,
     )
     nan = jnp.full((), jnp.nan, theta.dtype)
-    record = Record(
-        cost=cost,
-        gradient_norm=jnp.linalg.norm(estimate.mean),
-        variance=estimate.variance,
-        alpha=nan if estimate.alpha is None else estimate.alpha.alpha,
-        nonfinite=(estimate.num_nonfinite - padding).astype(theta.dtype),
-        residual=jnp.zeros((), theta.dtype) if residual is None else jnp.max(residual),
-    )
+    record = {
+        "cost": cost,
+        "gradient_norm": jnp.linalg.norm(estimate.mean),
+        "variance": estimate.variance,
+        "alpha": nan if estimate.alpha is None else estimate.alpha.alpha,
+        "nonfinite": (estimate.num_nonfinite - padding).astype(theta.dtype),
+        "residual": jnp.zeros((), theta.dtype) if residual is None else jnp.max(residual),
+    }
     return following, jax.tree.map(lambda figure: jnp.where(stopped_before, nan, figure), record)
 
 

@@ -23,12 +23,20 @@ import xarray as xr
 from jaxtyping import Array, Float, Int
 
 from estimators import Estimator
-from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.gradient_numbers import estimate_of, padded
 from mjx_study.experiment.quadrature import QUADRATURE, Line, Means, applies, closed_form, grid, means
 from mjx_study.experiment.resolution import line_of
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of
-from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
+from mjx_study.experiment.study import (
+    Arrays,
+    Checkpoint,
+    Computation,
+    StudyCell,
+    StudyKind,
+    StudyPlan,
+    done,
+    estimators_of,
+)
 from mjx_study.experiment.tally import unconverged
 from mjx_study.options.option import OptionError
 from mjx_study.results.curves import landscape_findings, least_of
@@ -51,18 +59,18 @@ class Landscapes(StudyKind):
         return {"point": range(config.get("points") or 0)}
 
     def describe(self, plan: StudyPlan) -> str:
-        return f"{plan.settings.points} points"
+        return f"{plan.config.settings.points} points"
 
     def check(self, plan: StudyPlan, cell: StudyCell) -> None:
         config, task = plan.config, plan.task_of(cell)
         if config.theta is not None and task.policy.num_params == 1:
             raise OptionError("theta", "has one entry, and the line is its range: give {} instead", "span")
-        line_of(task, plan.settings.points, config.span, config.direction, config.seed)
+        line_of(task, plan.config.settings.points, config.span, config.direction, config.seed)
 
     def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
         task = plan.task_of(cell)
         exact = QUADRATURE if not cell.model.analytic and applies(task) else 0
-        return plan.settings.points * plan.config.seeds * rollouts_of(plan.oracles, cell.samples, task) + exact
+        return plan.config.settings.points * plan.config.seeds * rollouts_of(plan.oracles, cell.samples, task) + exact
 
     def computation(self, plan: StudyPlan) -> "LandscapeComputation":
         return LandscapeComputation(plan)
@@ -104,7 +112,7 @@ class LandscapeComputation(Computation):
         keys, columns, solved = cell_keys(config.seed, config.seeds), [], []
         samples, size = np.asarray(config.seeds * cell.samples), plan.padded_samples(cell, config.seeds)
         for point, theta in enumerate(line.thetas(task.theta.dtype)):
-            checkpoint.report(point, plan.settings.points, "points of the line")
+            checkpoint.report(point, plan.config.settings.points, "points of the line")
             drawn, _, residuals = draw_batches(objective, theta, keys, plan.oracles, cell.samples, slice(None))
             solved += residuals.values()
             pooled = jax.tree.map(lambda leaf: leaf.reshape(1, -1, *leaf.shape[2:]), drawn)
@@ -154,7 +162,6 @@ def _slopes(
 
 
 def _mean(sample: Float[Array, " samples"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Mean and standard error."""
     finite = jnp.isfinite(sample)
     count = jnp.sum(finite)
     return jnp.mean(sample, where=finite), jnp.std(sample, where=finite, ddof=1) / jnp.sqrt(count)

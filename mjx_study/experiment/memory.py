@@ -33,8 +33,8 @@ def padded_seeds(seeds: int) -> int:
     return next(size for size in (16**power for power in range(1, 9)) if size >= seeds)
 
 
-def numbers_per_sample(task: Task, oracle: str) -> int:
-    """Count of numbers held per sample of a batch."""
+def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int, draws: int = BIAS_DRAWS) -> int:
+    """Memory per sample [bytes]: every batch, gradients of every estimator, and the draws of the bias test."""
     params, (steps, dimensions) = task.policy.num_params, task.policy.noise_shape
     noise = steps * dimensions * (1 if task.policy.additive else 1 + params)  # scores, and the policy's Jacobian
     states = task.scene.host.nq + task.scene.host.nv + task.scene.host.na
@@ -49,13 +49,8 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
         "step_differentiation": noise + 2,
         "linearisation": 2 * steps + noise + task.horizon * (inputs * (states + 1) + dimensions * states),
     }
-    return each[oracle]
-
-
-def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int, draws: int = BIAS_DRAWS) -> int:
-    """Memory per sample [bytes]: every batch, gradients of every estimator, and the draws of the bias test."""
-    numbers = sum(numbers_per_sample(task, oracle) for oracle in oracles)
-    return 8 * (numbers + 3 * estimators * task.policy.num_params + 2 * draws)
+    numbers = sum(each[oracle] for oracle in oracles)
+    return 8 * (numbers + 3 * estimators * params + 2 * draws)
 
 
 def bytes_of_moments(estimators: Sequence[Estimator], params: int) -> int:

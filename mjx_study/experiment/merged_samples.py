@@ -13,8 +13,7 @@ import numpy as np
 
 from estimators import ORACLES
 from estimators.merged_samples import Moments
-from mjx_study.experiment.checkpoint import Arrays
-from mjx_study.experiment.study import Work
+from mjx_study.experiment.study import Arrays, Work
 from mjx_study.experiment.tally import Tally
 
 REFERENCE_UNIT: Final = 0

@@ -12,9 +12,8 @@ from estimators.interpolation import check_weights
 from estimators.noise import check_sigma
 from mjx_study.choices import CONES, REFERENCE
 from mjx_study.experiment.memory import LARGEST_BATCH
-from mjx_study.experiment.resolution import at_theta
+from mjx_study.experiment.resolution import at_theta, reject_unused_options
 from mjx_study.experiment.study import Group, StudyCell, StudyKind, StudyPlan, estimators_of
-from mjx_study.experiment.unused_options import reject_unused_options
 from mjx_study.graph.native import in_numpy
 from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for, natively

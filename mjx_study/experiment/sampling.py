@@ -39,8 +39,8 @@ class Objectives:
 def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
     """Independent keys for each seed's batches and tests, and for the reference; the same in every cell."""
     of_seeds, (odd, candidate) = jax.device_get(_cell_keys(seed, padded_seeds(seeds)))
-    zeroth, first, tests = (_wrapped(data[:seeds]) for data in of_seeds)
-    reference = _wrapped(odd), _wrapped(candidate)
+    zeroth, first, tests = (jax.random.wrap_key_data(data[:seeds]) for data in of_seeds)
+    reference = tuple(map(jax.random.wrap_key_data, (odd, candidate)))
     return {"order": [zeroth, first], "reference": reference, "tests": tests}
 
 
@@ -54,11 +54,8 @@ def _cell_keys(seed: Int[Array, ""] | int, seeds: int) -> Any:
 
 def rows_of_keys(keys: Key[Array, "*rows"], rows: Any) -> Any:
     """Some of an array of keys, indexed on the host, where no program is compiled for each size."""
-    return _wrapped(np.asarray(jax.random.key_data(keys))[rows])
-
-
-def _wrapped(data: Any) -> Any:
-    return jax.random.wrap_key_data(data)
+    data: Any = np.asarray(jax.random.key_data(keys))
+    return jax.random.wrap_key_data(data[rows])
 
 
 @partial(jax.jit, static_argnums=2)
@@ -72,8 +69,8 @@ def _keys_of_seeds(streams: Key[Array, " seeds"], first: int, count: int) -> Key
     """Keys of consecutive samples of several seeds, one seed after the other, in a program for any small numbers."""
     seeds, padded = len(streams), padded_size(count)
     rows = np.minimum(np.arange(padded_seeds(seeds) if padded <= PADDED[-1] else seeds), seeds - 1)
-    data = np.asarray(jax.random.key_data(_sample_keys_of(rows_of_keys(streams, rows), first, padded)))
-    return _wrapped(data[:seeds, :count].reshape(-1, data.shape[-1]))
+    data: Any = np.asarray(jax.random.key_data(_sample_keys_of(rows_of_keys(streams, rows), first, padded)))
+    return jax.random.wrap_key_data(data[:seeds, :count].reshape(-1, data.shape[-1]))
 
 
 _sample_keys_of = jax.jit(jax.vmap(sample_keys, (0, None, None)), static_argnums=2)

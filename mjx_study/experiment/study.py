@@ -7,8 +7,9 @@ any order and anywhere, since each depends on the plan alone.
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Hashable
+from collections.abc import Callable, Generator, Hashable, Mapping
 from concurrent.futures import Future
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -18,11 +19,10 @@ import numpy as np
 import estimators
 from estimators import Estimator, find_estimator
 from estimators.user_inputs import inputs_read
-from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.memory import bytes_per_sample, check_batches, padded_size
 from mjx_study.experiment.resolution import configured_estimators
 from mjx_study.identity import contents, estimator_contents
-from mjx_study.options.configuration import Settings, StudyConfig
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.kind import StudyResults, find_kind
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import TASKS, registered_name
@@ -30,6 +30,7 @@ from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Recipe, Task
 
 Result = TypeVar("Result")
+Arrays = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,12 +77,8 @@ class StudyPlan:
     warnings: tuple[str, ...]
 
     @cached_property
-    def settings(self) -> Settings:
-        return self.config.settings
-
-    @cached_property
     def kind(self) -> "StudyKind":
-        return find_kind(self.settings.kind)
+        return find_kind(self.config.settings.kind)
 
     @cached_property
     def chosen(self) -> dict[tuple[int, float], tuple[Estimator, ...]]:
@@ -92,10 +89,6 @@ class StudyPlan:
     def oracles(self) -> tuple[str, ...]:
         """Oracles that the estimators need, evaluations included."""
         return estimators.oracles_of(map(find_estimator, self.config.estimators), "evaluation")
-
-    def with_chunk(self, size: int) -> "StudyPlan":
-        """The plan with another chunk size, such as that of a study begun earlier."""
-        return dataclasses.replace(self, chunk_size=size)
 
     def task_of(self, cell: StudyCell) -> Task:
         """A cell's task, with the task's own sigma."""
@@ -175,6 +168,41 @@ def estimators_of(plan: StudyPlan, cell: StudyCell) -> tuple[Estimator, ...]:
     if key not in plan.chosen:
         plan.chosen[key] = configured_estimators(plan.config, plan.task_of(cell).replace(sigma=cell.sigma))
     return plan.chosen[key]
+
+
+class StudyError(ValueError):
+    """A folder holds no study, another study, or a damaged file."""
+
+
+def reason_of(error: Exception) -> str:
+    """What is wrong with a file, in one line."""
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """Checkpointing within a cell.
+
+    Attributes:
+        kept: arrays of the last checkpoint.
+        report: reports progress within the cell: done, total, and what is being computed.
+        name: name of the checkpoint in messages.
+    """
+
+    kept: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    save: Callable[[Arrays], None] = lambda arrays: None
+    report: Callable[[int, int, str], None] = lambda done, total, what: None
+    name: str = "the checkpoint"
+
+    @contextmanager
+    def restored(self) -> Generator[None]:
+        """Let arrays of the checkpoint that are missing or of another form be a StudyError."""
+        try:
+            yield
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            reason = f"no {error}" if isinstance(error, KeyError) else reason_of(error)
+            message = f"{self.name} does not fit the study ({reason}); move it away to compute its cell again"
+            raise StudyError(message) from error
 
 
 class Work:

@@ -9,14 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjx_study.gradcheck.coordinates import (
-    LENGTH,
-    Coordinate,
-    Coordinates,
-    joint_name,
-    joints_above,
-    quaternions,
-)
+from mjx_study.gradcheck.coordinates import LENGTH, Coordinate, Coordinates, joint_name, joints_above, quaternions
 from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.simulation.engine import HostState, host_data
 from mjx_study.simulation.scene import num_constraint_rows

@@ -17,8 +17,7 @@ from mjx_study.gradcheck.programs import Compiler, ContactCase, Programs
 from mjx_study.gradcheck.report import CostCheck, Finding, GradcheckReport, StepCheck, gravity
 from mjx_study.gradcheck.states import start_of, states_of
 from mjx_study.gradcheck.steps import check_state, collect, step_check
-from mjx_study.options.option import OptionError
-from mjx_study.options.rules import reject_untaken
+from mjx_study.options.option import OptionError, reject_untaken
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
@@ -82,7 +81,12 @@ def plan_gradcheck(
     Raises:
         ValueError: unusable family or stiffness, too few states, or float32.
     """
-    _check(task, states)
+    if task.scene.template.qpos.dtype != jnp.float64:
+        raise ValueError("gradcheck compares with differences and needs float64, the default precision")
+    if task.scene.host.nv == 0:
+        raise ValueError(f"{task.scene.name} has no degree of freedom: there is nothing to differentiate")
+    if states < 1:
+        raise ValueError(f"states must be at least 1, got {states}")
     if families is None:
         families = ("mjcf",) if task.contact_pair is None else CONTACT
     own = task.defaults.stiffnesses
@@ -92,7 +96,8 @@ def plan_gradcheck(
     if not cells:
         raise ValueError("no contact model to check: give at least one stiffness and one contact family")
     reject_untaken(families, stiffness=stiffnesses, damping=damping, smoothing=smoothing)
-    _check_stock(families, stock)
+    if stock and (laws := laws_of(families)):
+        raise OptionError("stock", f"is for MuJoCo's law, which {laws[0]} does not have: omit it")
     return GradcheckPlan(task, True, cells, messages, states, seed, stock)
 
 
@@ -129,7 +134,6 @@ def plan_scene_gradcheck(
     if families is None:
         families = ("mjcf",) if stiffnesses is None else ("mujoco",)
     reject_untaken(families, stiffness=stiffnesses, damping=damping, smoothing=smoothing)
-    _check_stock(families, stock)
     swept = takes_stiffness(families)
     if swept and stiffnesses is None:
         raise OptionError("stiffness", "must be given in N/m, along with {}, for a family that takes one", "pair")
@@ -137,24 +141,9 @@ def plan_scene_gradcheck(
         raise OptionError("stiffness", "in N/m requires the effective mass of a contact: give {} GEOM,GEOM", "pair")
     if pair is not None and not swept:
         raise OptionError("pair", "is for a stiffness: give {}, or omit it", "stiffness")
-    subject = scene_task(scene, horizon=horizon, pair=pair)
-    _check(subject, states)
-    cells, messages = family_grid(subject, families, stiffnesses or (), damping, smoothing)
-    return GradcheckPlan(subject, False, cells, messages, states, seed, stock)
-
-
-def _check_stock(families: Sequence[str], stock: bool) -> None:
-    if stock and (laws := laws_of(families)):
-        raise OptionError("stock", f"is for MuJoCo's law, which {laws[0]} does not have: omit it")
-
-
-def _check(task: Task, states: int) -> None:
-    if task.scene.template.qpos.dtype != jnp.float64:
-        raise ValueError("gradcheck compares with differences and needs float64, the default precision")
-    if task.scene.host.nv == 0:
-        raise ValueError(f"{task.scene.name} has no degree of freedom: there is nothing to differentiate")
-    if states < 1:
-        raise ValueError(f"states must be at least 1, got {states}")
+    task, model = scene_task(scene, horizon=horizon, pair=pair), {"damping": damping, "smoothing": smoothing}
+    plan = plan_gradcheck(task, families, stiffnesses, **model, seed=seed, states=states, stock=stock)
+    return dataclasses.replace(plan, is_task=False)
 
 
 @quiet_engine()  # intermediate states may cause warnings

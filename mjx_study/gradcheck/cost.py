@@ -19,14 +19,11 @@ from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
 DIRECTIONS: Final = 6
-BATCH: Final = 8
-"""Rollouts per call of the cost program."""
+BATCH: Final = 8  # rollouts per call of the cost program
 DIFFERENCE_TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-9
-CLOSED_FORM_TOLERANCE: Final = 1e-3
-"""Relative distance from the closed form's gradient that counts as agreement."""
-MAX_GROWTH: Final = 2.0
-"""Allowed growth of the distance with stiffness, which should bring the two models together."""
+CLOSED_FORM_TOLERANCE: Final = 1e-3  # relative distance from the closed form's gradient that counts as agreement
+MAX_GROWTH: Final = 2.0  # allowed growth of the distance with stiffness, which should bring the two models together
 
 
 class CostPrograms:
@@ -79,15 +76,10 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     truth = take_differences(programs.costs(cell.contact, moves(directions))[:, None])
     error = np.abs(directions @ gradient - truth.value[0])
     apart = error > DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0]
-    verdict = cost_verdict(
-        finite=bool(np.all(np.isfinite(gradient))),
-        modes=modes,
-        residual=float(residual),
-        excused=[
-            "jump" if jump else "kink" if kink else None
-            for jump, kink in zip(truth.jump[0, apart], (truth.kink[0] & (error <= truth.gap[0]))[apart], strict=True)
-        ],
-    )
+    kinks = truth.kink[0] & (error <= truth.gap[0])
+    excused = ["jump" if truth.jump[0, at] else "kink" if kinks[at] else None for at in np.flatnonzero(apart)]
+    finite = bool(np.all(np.isfinite(gradient)))
+    verdict = cost_verdict(finite=finite, modes=modes, residual=float(residual), excused=excused)
     closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
     errors = (modes, float(error.max() / scale), float(truth.gap.max() / scale), closed_form, float(residual))
     check = CostCheck(cell.family, cell.stiffness_or_zero, norm, *errors, verdict)

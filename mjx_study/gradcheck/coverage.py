@@ -24,8 +24,7 @@ PARTS: Final = ("contact", *ZONES, "limit", "friction loss", "held", "slipping",
 """Parts that a state can exercise; friction loss is held, or slipping at its bound."""
 OPTIONAL: Final = frozenset({"separate", "contact", "friction loss"})
 """Parts counted but not required: undamped contact never separates within its margin; the others have subparts."""
-ALIGNED_SINE: Final = 1e-9
-"""Sine of the angle below which directions coincide."""
+ALIGNED_SINE: Final = 1e-9  # sine of the angle below which directions coincide
 _STATE, _KIND = mujoco.mjtConstraintState, mujoco.mjtConstraint
 _LIMITS = (int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON))
 _LOSSES = (int(_KIND.mjCNSTR_FRICTION_DOF), int(_KIND.mjCNSTR_FRICTION_TENDON))

@@ -14,8 +14,7 @@ TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-6
 """Allowed relative difference of forward and reverse mode; rounding alone reaches 1e-7 in ill-conditioned solves."""
 RESIDUAL_TOLERANCE: Final = 1e-6
-MIN_SCALE: Final = 1e-3
-"""Smallest scale of a row's entries, relative to the largest row of its kind."""
+MIN_SCALE: Final = 1e-3  # smallest scale of a row's entries, relative to the largest row of its kind
 MIN_STEEPNESS: Final = 0.1
 """Difference of one-sided slopes, relative to a row's largest entry, that rounding cannot explain."""
 MAX_UNCERTAINTY: Final = 1e-5

@@ -17,12 +17,9 @@ from mjx_study.gradcheck.coordinates import Coordinates
 RATIO: Final = 4.0
 SIZES: Final = tuple(2.5e-4 / RATIO**power for power in range(8))
 """Step sizes [m, rad, ...], down to 1.5e-8; the finest smooth structure of MuJoCo's contact is 1 mm."""
-ROUNDING: Final = 1e-13
-"""Relative rounding noise of a step's output, solved to rounding."""
-EPSILON: Final = 1e-15
-"""A few rounding errors of a float64."""
-SMOOTH, KINK = 1.5, 0.5
-"""Powers of h between which the second difference indicates a kink, whose power is 1."""
+ROUNDING: Final = 1e-13  # relative rounding noise of a step's output, solved to rounding
+EPSILON: Final = 1e-15  # a few rounding errors of a float64
+SMOOTH, KINK = 1.5, 0.5  # powers of h between which the second difference indicates a kink, whose power is 1
 
 
 @dataclasses.dataclass(frozen=True)

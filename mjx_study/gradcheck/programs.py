@@ -27,12 +27,9 @@ from mjx_study.watchdog import awaited
 
 OPTIONS: Final = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": False}
 """XLA options on CPUs: half the compile time of the default code generator, and fast enough for these checks."""
-THREADS: Final = 2
-"""Number of programs compiled at once; each takes a core and up to a gigabyte for large models."""
-BATCH: Final = 64
-"""Steps per call of the value program."""
-DIRECTIONS: Final = 96
-"""Maximum number of directions, forwards or backwards, per call of a derivative program."""
+THREADS: Final = 2  # number of programs compiled at once; each takes a core and up to a gigabyte for large models
+BATCH: Final = 64  # steps per call of the value program
+DIRECTIONS: Final = 96  # maximum number of directions, forwards or backwards, per call of a derivative program
 
 
 class Compiler(Builds):

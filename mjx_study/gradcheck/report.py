@@ -10,8 +10,7 @@ from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
 from mjx_study.table import Column, as_plain, grouped, tabulate
 
-MAX_SHOWN: Final = 12
-"""Maximum number of findings in the text, unless all are requested."""
+MAX_SHOWN: Final = 12  # maximum number of findings in the text, unless all are requested
 PLACES: Final = {
     "pushed to": "a rollout with random pushes of so many m/s or rad/s, to what the task's own does not reach",
     "from pose": "a fall from a random pose, likewise",

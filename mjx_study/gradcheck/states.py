@@ -10,26 +10,21 @@ import mujoco
 import numpy as np
 
 from mjx_study.gradcheck.coverage import OPTIONAL, Coverage, count_coverage, exercised, possible
+from mjx_study.gradcheck.engine_step import forward
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.engine import HostState, converged_host, host_data, host_state
 from mjx_study.simulation.scene import Scene
 
 SPEED: Final = 0.1
 """Standard deviation of sampled initial velocities [m/s or rad/s]: small, but nothing is at rest or at a tie."""
-FASTER: Final = (1.0, 5.0)
-"""Standard deviations in rollouts that search for parts the first did not reach."""
-PUSHES: Final = 10
-"""Number of times that new velocities and controls are drawn in such a rollout."""
+FASTER: Final = (1.0, 5.0)  # standard deviations in rollouts that search for parts the first did not reach
+PUSHES: Final = 10  # number of times that new velocities and controls are drawn in such a rollout
 CONTROL: Final = 0.3
 """Standard deviation of sampled controls, relative to half their range; absolute for unlimited controls."""
-POSES: Final = 30
-"""Number of random poses tried for parts that no rollout reached."""
-FALL: Final = 50
-"""Number of steps of the rollout from each pose."""
-MAX_EXCESS: Final = 0.01
-"""Largest excess of a pose beyond a limit, relative to the range."""
-LOOK: Final = 200
-"""Number of states searched at once for one that exercises a missing part."""
+POSES: Final = 30  # number of random poses tried for parts that no rollout reached
+FALL: Final = 50  # number of steps of the rollout from each pose
+MAX_EXCESS: Final = 0.01  # largest excess of a pose beyond a limit, relative to the range
+LOOK: Final = 200  # number of states searched at once for one that exercises a missing part
 
 _SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 
@@ -73,11 +68,14 @@ def states_of(
     parts, unreachable = possible(scene, host)
     start = start_of(scene) if visited is None else visited[0]
     at_rest = ", at rest" if visited is None and not start.qvel.any() else ""
-    first = Sample(f"start{at_rest}", 0, start, _parts(host, start))
+    first = Sample(f"start{at_rest}", 0, start, exercised(forward(host, start)))
     if visited is None:
         rollout = list(_rollout(host, _stirred(host, start, random, SPEED, CONTROL), horizon))
     else:
-        rollout = [Sample(f"step {index}", index, state, _parts(host, state)) for index, state in enumerate(visited)]
+        rollout = [
+            Sample(f"step {index}", index, state, exercised(forward(host, state)))
+            for index, state in enumerate(visited)
+        ]
     chosen = _cover([first], rollout[1:], parts - OPTIONAL, count)
     chosen = _cover(chosen, _elsewhere(host, start, horizon, random), parts - OPTIONAL, count)
     rest = [sample for sample in rollout[1:] if sample not in chosen]
@@ -138,12 +136,6 @@ def _rollout(
         if not np.all(np.isfinite(data.qpos)) or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
             return
         yield Sample(f"step {index}{label}", index, before, exercised(data))
-
-
-def _parts(host: mujoco.MjModel, state: HostState) -> frozenset[str]:
-    data = host_data(host, state)
-    mujoco.mj_forward(host, data)
-    return exercised(data)
 
 
 def _stirred(

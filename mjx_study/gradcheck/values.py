@@ -19,11 +19,9 @@ from mjx_study.gradcheck.engine_step import EngineStep, forward, tangent_of
 from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.simulation.engine import HostState
 
-TOLERANCE: Final = 1e-8
-"""Relative difference above which two implementations differ in a quantity."""
+TOLERANCE: Final = 1e-8  # relative difference above which two implementations differ in a quantity
 FAR: Final = 1e100
-MIN_ROW: Final = 1e-12
-"""Size below which a constraint row counts as zero."""
+MIN_ROW: Final = 1e-12  # size below which a constraint row counts as zero
 STAGES: Final = {
     "xpos": "body positions",
     "ten_length": "tendon lengths",

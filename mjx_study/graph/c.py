@@ -13,9 +13,10 @@ from typing import Any, Final
 
 import numpy as np
 from jax import lax
+from jax.core import ShapedArray
 
 from mjx_study.graph.function import Passes, ScalarFunction, depending_on
-from mjx_study.graph.nodes import ELEMENTWISE, Node, depth_first, entries_of, no_type_check
+from mjx_study.graph.nodes import ELEMENTWISE, Node, depth_first, entries_of
 from mjx_study.graph.parts import Loop, Statement, in_parts
 
 COMPARISONS: Final = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
@@ -56,7 +57,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
         NotWrittenError: an operation or a type is not covered.
     """
     writer = Writer(function)
-    statements, forms_in, forms_out = writer.written(passes)
+    statements, inputs, outputs = writer.written(passes)
     is_long = platform == "gpu" and function.size > LONG_KERNEL
     most = MOST_TOGETHER["gpu, long" if is_long else platform]
     functions, num_kept = in_parts(statements, writer.loads, *most)
@@ -64,15 +65,15 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
         kernel = [_text("prelude.cu"), _text("functions.c"), *writer.tables, *functions, _text("kernel.cu")]
         parts = ["#ifdef __CUDACC_RTC__", *kernel, "#else", _text("launcher.c"), "#endif"]
         return "\n".join(
-            [_batch(forms_in, forms_out), f"#define KEPT {num_kept}", f"#define LONG {int(is_long)}", *parts, ""]
+            [_batch(inputs, outputs), f"#define KEPT {num_kept}", f"#define LONG {int(is_long)}", *parts, ""]
         )
     wide = any(dtype.itemsize == 8 for dtype in writer.dtypes)
     return "\n".join(
         [
             f"#define WIDE {int(wide)}",
-            f"#define INPUTS {_forms(forms_in)}",
-            f"#define OUTPUTS {_forms(forms_out)}",
-            f"#define BYTES {sum(size * np.dtype(dtype).itemsize for size, dtype, _ in (*forms_in, *forms_out))}",
+            f"#define INPUTS {_forms(inputs)}",
+            f"#define OUTPUTS {_forms(outputs)}",
+            f"#define BYTES {sum(aval.size * aval.dtype.itemsize for aval in (*inputs, *outputs))}",
             f"#define KEPT {num_kept}",
             _text("prelude.c"),
             _text("functions.c"),
@@ -83,11 +84,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
     )
 
 
-Forms = Sequence[tuple[int, Any, int]]
-"""Entries, type and dimensions of arrays."""
-
-
-def _batch(inputs: Forms, outputs: Forms) -> str:
+def _batch(inputs: Sequence[ShapedArray], outputs: Sequence[ShapedArray]) -> str:
     """Argument of a kernel, for the kernel and for what starts it."""
     if 12 * len(inputs) + 8 * len(outputs) > MAX_ARGUMENT:
         raise NotWrittenError(f"{len(inputs)} inputs and {len(outputs)} outputs")
@@ -95,8 +92,8 @@ def _batch(inputs: Forms, outputs: Forms) -> str:
 #define THREADS 128
 #define NUM_IN {len(inputs)}
 #define NUM_OUT {len(outputs)}
-#define RANKS_OF_INPUTS {", ".join(str(rank) for *_, rank in inputs)}
-#define RANK_OF_OUTPUT {outputs[0][2]}
+#define RANKS_OF_INPUTS {", ".join(str(aval.ndim) for aval in inputs)}
+#define RANK_OF_OUTPUT {outputs[0].ndim}
 struct batch {{
   long count;
   const char *in[NUM_IN];
@@ -109,9 +106,9 @@ def _text(name: str) -> str:
     return resources.files("mjx_study.graph").joinpath(name).read_text()
 
 
-def _forms(arrays: Forms) -> str:
+def _forms(avals: Sequence[ShapedArray]) -> str:
     """Initialisers of the handler's descriptions of arrays: entries, bytes of an entry, dimensions."""
-    return ", ".join(f"{{{size}, {np.dtype(dtype).itemsize}, {rank}}}" for size, dtype, rank in arrays)
+    return ", ".join(f"{{{aval.size}, {aval.dtype.itemsize}, {aval.ndim}}}" for aval in avals)
 
 
 def _type(dtype: Any) -> str:
@@ -121,7 +118,6 @@ def _type(dtype: Any) -> str:
     return name
 
 
-@no_type_check
 def _constant(value: Any) -> str:
     kind = _type(value.dtype)
     return f"ALL({kind}, {_literal(kind, value.item())})"
@@ -137,7 +133,6 @@ def _literal(kind: str, value: Any) -> str:
     return "NAN" if math.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
 
 
-@no_type_check
 class Writer:
     """Statements that compute a function; the variable of a node has its number."""
 
@@ -164,12 +159,13 @@ class Writer:
             for (kind, entries), name in self.constant_vectors.items()
         ]
 
-    def written(self, passes: Passes | None) -> tuple[list[Statement | Loop], Forms, Forms]:
-        """All statements, and the forms of the inputs and outputs of the function, or of its passes."""
-        function = self._function
-        types, avals = (function.types, function.avals) if passes is None else passes.avals(function)
-        inputs, outputs = ([(math.prod(at.shape), at.dtype, at.ndim) for at in each] for each in (types, avals))
-        return self._statements() if passes is None else self._loop_of(passes), inputs, outputs
+    def written(
+        self, passes: Passes | None
+    ) -> tuple[list[Statement | Loop], Sequence[ShapedArray], Sequence[ShapedArray]]:
+        """All statements, and the types of the inputs and outputs of the function, or of its passes."""
+        if passes is not None:
+            return self._loop_of(passes), *passes.avals(self._function)
+        return self._statements(), self._function.types, self._function.avals
 
     def _statements(self) -> list[Statement | Loop]:
         """All statements, with every output stored as soon as it is known."""

@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 
 from mjx_study.graph.function import run
-from mjx_study.graph.nodes import Node, ScalarGraph, entries_of, filled, needed_for, no_type_check
+from mjx_study.graph.nodes import Node, ScalarGraph, entries_of, filled, needed_for
 
 Sparse = dict[int, Any]
 """Entries by column; others are zero."""
@@ -35,7 +35,6 @@ class NotDifferentiableError(Exception):
     """The derivative would have to pass a loop or an operation on whole arrays."""
 
 
-@no_type_check
 def push(
     graph: ScalarGraph, outputs: Sequence[np.ndarray], inputs: Sequence[np.ndarray], changes: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
@@ -48,7 +47,6 @@ def push(
     return _arrays(outputs, _pushed(graph, entries_of(outputs), seeds))
 
 
-@no_type_check
 def pull(
     graph: ScalarGraph, outputs: Sequence[np.ndarray], inputs: Sequence[np.ndarray], adjoints: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
@@ -89,7 +87,6 @@ def pull(
     return _arrays(inputs, [whole(each) for each in entries_of(inputs)])
 
 
-@no_type_check
 def _taken(graph: ScalarGraph, which: Any, case: int) -> tuple[Any, bool]:
     """Condition under which a selection takes a case."""
     if which.dtype == _BOOL:
@@ -97,7 +94,6 @@ def _taken(graph: ScalarGraph, which: Any, case: int) -> tuple[Any, bool]:
     return graph.scalar(lax.eq_p, (which, which.dtype.type(case)), _BOOL), True
 
 
-@no_type_check
 def _gathered(graph: ScalarGraph, parts: dict[Conditions, Any], dtype: Any) -> tuple[Any, Conditions]:
     """Sum of the parts of an adjoint, and the conditions under which it counts."""
     parts = dict(parts)
@@ -111,7 +107,6 @@ def _gathered(graph: ScalarGraph, parts: dict[Conditions, Any], dtype: Any) -> t
     return adjoint, where
 
 
-@no_type_check
 def jacobian(graph: ScalarGraph, outputs: np.ndarray, inputs: np.ndarray) -> np.ndarray:
     """Matrix of the derivatives of a vector of outputs over a vector of inputs, by forward mode.
 
@@ -128,13 +123,11 @@ def jacobian(graph: ScalarGraph, outputs: np.ndarray, inputs: np.ndarray) -> np.
     return filled((len(outputs), len(inputs)), entries)
 
 
-@no_type_check
 def _arrays(like: Sequence[np.ndarray], found: Sequence[Sparse]) -> list[np.ndarray]:
     entries = iter([each.get(0, old.dtype.type(0)) for each, old in zip(found, entries_of(like), strict=True)])
     return [filled(each.shape, itertools.islice(entries, each.size)) for each in like]
 
 
-@no_type_check
 def _pushed(graph: ScalarGraph, outputs: Sequence[Any], seeds: Mapping[int, Sparse]) -> list[Sparse]:
     """Changes of the outputs, from those of the inputs by number, for several columns at once."""
     known = dict(seeds)
@@ -144,7 +137,6 @@ def _pushed(graph: ScalarGraph, outputs: Sequence[Any], seeds: Mapping[int, Spar
     return [known.get(each.number, {}) if isinstance(each, Node) else {} for each in outputs]
 
 
-@no_type_check
 def _change(graph: ScalarGraph, node: Node, known: Mapping[int, Sparse]) -> Sparse:
     """Change of a node from those of its arguments."""
     changes = [known.get(each.number, {}) if isinstance(each, Node) else {} for each in node.arguments]
@@ -166,18 +158,15 @@ def _change(graph: ScalarGraph, node: Node, known: Mapping[int, Sparse]) -> Spar
     return total
 
 
-@no_type_check
 def _in(numbers: set[int], entry: Any) -> bool:
     return isinstance(entry, Node) and entry.number in numbers
 
 
-@no_type_check
 def _passes(node: Node) -> bool:
     """Whether a change of its arguments may change a node (not an integer or truth value)."""
     return node.dtype is None or node.dtype.kind == "f"
 
 
-@no_type_check
 def _refuse(node: Node) -> None:
     if isinstance(node.operation, str):
         source = node.arguments[0] if node.arguments else node
@@ -185,14 +174,12 @@ def _refuse(node: Node) -> None:
         raise NotDifferentiableError(what)
 
 
-@no_type_check
 def _accumulate(graph: ScalarGraph, total: dict[Any, Any], terms: dict[Any, Any], dtype: Any) -> None:
     for at, term in terms.items():
         if isinstance(term, Node) or term != 0:
             total[at] = graph.scalar(lax.add_p, (total[at], term), dtype) if at in total else term
 
 
-@no_type_check
 def _along(graph: ScalarGraph, node: Node, place: int, change: Any, kind: Any) -> Any:
     """Multiply a change by the derivative of a node over an argument; `kind` is the result's type."""
     dtype, arguments = node.dtype, node.arguments
@@ -220,16 +207,10 @@ def _along(graph: ScalarGraph, node: Node, place: int, change: Any, kind: Any) -
             strict = scalar(lax.select_n_p, wins, dtype.type(0), dtype.type(1))
             return scalar(lax.mul_p, change, scalar(lax.select_n_p, ties, strict, dtype.type(0.5)))
         case "convert_element_type":
-            return _converted(graph, change, kind)
+            return graph.converted(change, kind)
     closed = _rule(node.operation, place, tuple(each.dtype for each in arguments), tuple(node.parameters.items()))
     (result,) = run(graph, closed, [filled((), [each]) for each in (change, *arguments)])
     return result[()]
-
-
-@no_type_check
-def _converted(graph: ScalarGraph, value: Any, dtype: Any) -> Any:
-    parameters = {"new_dtype": dtype, "weak_type": False, "sharding": None}
-    return graph.scalar(lax.convert_element_type_p, (value,), dtype, **parameters)
 
 
 @cache

@@ -12,7 +12,7 @@ from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
 from mjx_study.graph.function import ScalarFunction, array_of, bind_whole
-from mjx_study.graph.nodes import Node, needed_for, no_type_check
+from mjx_study.graph.nodes import Node, needed_for
 
 
 def evaluated(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
@@ -36,7 +36,6 @@ def written_out(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
     return jax.jit(jaxpr_as_fun(jax.make_jaxpr(evaluated(function))(*function.types)))
 
 
-@no_type_check
 def _emit(nodes: Iterable[Node], values: dict[int, Any]) -> None:
     """Compute nodes with JAX, arguments first, and add them to `values`."""
     for node in nodes:

@@ -14,18 +14,11 @@ from jax import lax
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import Literal
 
-from mjx_study.graph.nodes import (
-    ELEMENTWISE,
-    Node,
-    ScalarGraph,
-    constants,
-    entries_of,
-    filled,
-    needed_for,
-    no_type_check,
-)
+from mjx_study.graph.nodes import ELEMENTWISE, Node, ScalarGraph, constants, entries_of, filled, needed_for
 from mjx_study.graph.rules import RULES
 
+MOST_KEPT: Final = 64
+"""Maximum number of functions of a kind that are kept."""
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 _WITH_RULES: Final = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "ruled": "jaxpr"}
@@ -42,7 +35,7 @@ class ScalarFunction:
         outputs: one array of nodes and NumPy scalars per output.
         avals: types of the outputs.
         structure: pytree of the outputs.
-        derived: what has been derived from it, by kind.
+        values: the function captured for its values only, if that differs.
     """
 
     graph: ScalarGraph
@@ -50,7 +43,7 @@ class ScalarFunction:
     outputs: list[np.ndarray]
     avals: Sequence[Any]
     structure: Any
-    derived: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False)
+    values: "ScalarFunction | None" = None
 
     @cached_property
     def needed(self) -> list[Node]:
@@ -73,16 +66,17 @@ class ScalarFunction:
     @property
     def types(self) -> list[ShapedArray]:
         """Types of the inputs."""
-        return [ShapedArray(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in self.inputs]
+        return list(map(aval_of, self.inputs))
 
     def of(self, places: Sequence[int]) -> "ScalarFunction":
         """Return the function of some of its inputs, which does not depend on the others."""
-        key = "of", tuple(places)
-        if key not in self.derived:
-            self.derived[key] = dataclasses.replace(self, inputs=[self.inputs[place] for place in places])
-            if "values" in self.derived:
-                self.derived[key].derived["values"] = self.derived["values"].of(places)
-        return self.derived[key]
+        values = None if self.values is None else self.values.of(places)
+        return dataclasses.replace(self, inputs=[self.inputs[place] for place in places], values=values)
+
+
+def aval_of(array: np.ndarray) -> ShapedArray:
+    """Type of an array of entries; that of an empty one is float."""
+    return ShapedArray(array.shape, array.flat[0].dtype if array.size else np.dtype(float))
 
 
 def _count(nodes: list[Node], found: set[int]) -> None:
@@ -138,14 +132,11 @@ def capture(function: Callable[..., Any], *arguments: Any, most: int, values_onl
     return ScalarFunction(graph, inputs, outputs, jaxpr.out_avals, jax.tree.structure(shape))
 
 
-@no_type_check
 def inlined(graph: ScalarGraph, function: Callable[..., Any], *arrays: np.ndarray) -> list[np.ndarray]:
     """Add a function of floating-point arrays of nodes to a graph; its leaves."""
-    kinds = [jax.ShapeDtypeStruct(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in arrays]
-    return run(graph, jax.make_jaxpr(function)(*kinds), arrays)
+    return run(graph, jax.make_jaxpr(function)(*map(aval_of, arrays)), arrays)
 
 
-@no_type_check
 def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Evaluate a closed jaxpr; array entries are nodes or NumPy scalars."""
     jaxpr, consts = closed.jaxpr, [constants(each) for each in closed.consts]
@@ -164,7 +155,6 @@ def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[n
     return [read(atom) for atom in jaxpr.outvars]
 
 
-@no_type_check
 def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Sequence[np.ndarray]:
     name, parameters = equation.primitive.name, equation.params
     avals: list[Any] = [each.aval for each in equation.invars]
@@ -195,7 +185,6 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
     return graph.outputs(node, [each.aval for each in equation.outvars])
 
 
-@no_type_check
 def _branch(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Compute all branches and select one, as under `vmap`."""
     index, *operands = inputs
@@ -211,7 +200,6 @@ def _branch(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> 
     return first
 
 
-@no_type_check
 def _scan(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Write out all passes of a loop of known length."""
     parameters = equation.params
@@ -238,7 +226,6 @@ def scan_inputs(equation: Any, inputs: Sequence[Any]) -> tuple[list[Any], list[A
     return list(inputs[:first]), list(inputs[first:second]), list(inputs[second:])
 
 
-@no_type_check
 def _native(
     graph: ScalarGraph, function: ScalarFunction, inputs: Sequence[np.ndarray], batch: tuple[int, ...]
 ) -> list[np.ndarray]:
@@ -257,7 +244,6 @@ def _native(
     return outputs
 
 
-@no_type_check
 def _copy(graph: ScalarGraph, nodes: Iterable[Node], values: dict[int, Any]) -> None:
     """Add nodes of another graph, arguments first, where they are not in `values` yet."""
 
@@ -304,7 +290,6 @@ def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[n
     return [filled(aval.shape, itertools.islice(scalars, math.prod(aval.shape))) for aval in avals]
 
 
-@no_type_check
 def _loop_node(graph: ScalarGraph, start: list[Any], carried: list[Node], again: list[Any], after: list[Any]) -> Node:
     needed = needed_for([*again, *after])
     changing = depending_on(needed, carried)
@@ -312,7 +297,6 @@ def _loop_node(graph: ScalarGraph, start: list[Any], carried: list[Node], again:
     return graph.node("loop", (*start, *fixed), (carried, again, after), None)
 
 
-@no_type_check
 def depending_on(nodes: Iterable[Node], some: Iterable[Node]) -> set[int]:
     """Numbers of some nodes, and of those among `nodes`, arguments first, that depend on them."""
     found = {each.number for each in some}
@@ -330,7 +314,6 @@ def bind_whole(equation: Any, arrays: Sequence[Any]) -> Sequence[jax.Array]:
     return found if equation.primitive.multiple_results else [found]
 
 
-@no_type_check
 def array_of(entries: Iterable[Any], aval: Any) -> jax.Array:
     scalars = [jnp.asarray(each, aval.dtype) for each in entries]
     return jnp.stack(scalars).reshape(aval.shape) if scalars else jnp.zeros(aval.shape, aval.dtype)

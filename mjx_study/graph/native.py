@@ -18,7 +18,6 @@ from jax.interpreters import ad, batching, mlir
 from mjx_study.graph import cuda
 from mjx_study.graph.build import build_identity, build_library, compiler, known_libraries, library_ready
 from mjx_study.graph.c import NotWrittenError, source_of
-from mjx_study.graph.evaluation import written_out
 from mjx_study.graph.function import Passes, ScalarFunction, capture
 from mjx_study.graph.numpy_code import python_source
 
@@ -82,24 +81,6 @@ def _compiles() -> bool:
     return library_ready(build_library(source_of(function, jax.default_backend())))
 
 
-def as_native(values: ScalarFunction, function: ScalarFunction, *, early: bool = True) -> "NativeFunction | None":
-    """Native code for a function's values; None if it cannot be written.
-
-    Args:
-        values: the function captured for its values only.
-        function: the function, which derivatives are taken of.
-        early: whether to begin to build it now, or when a program with it is compiled.
-    """
-    native = NativeFunction(
-        lambda: written(values),
-        function.types,
-        function.avals,
-        lambda: written_out(function),
-        values,
-    )
-    return native if not early or POSTPONED.get() or native.begun() else None
-
-
 class NativeFunction:
     """A function as a library, and as a JAX program for derivatives and where there is no library.
 
@@ -161,22 +142,19 @@ def switched_on(switch: ContextVar[bool]) -> Generator[None]:
         switch.reset(token)
 
 
-def _plain(function: NativeFunction, batch: tuple[int, ...]) -> Callable[..., list[jax.Array]]:
+def _plain(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) -> list[jax.Array]:
     """The function as JAX operations, of arrays with leading dimensions `batch` or without."""
-
-    def program(*inputs: jax.Array) -> list[jax.Array]:
-        axes = tuple(0 if each.ndim > aval.ndim else None for each, aval in zip(inputs, function.inputs, strict=True))
-        each = function.program
-        for _ in batch:
-            each = jax.vmap(each, axes)
-        return each(*inputs)
-
-    return program
+    axes = tuple(0 if each.ndim > aval.ndim else None for each, aval in zip(inputs, function.inputs, strict=True))
+    each = function.program
+    for _ in batch:
+        each = jax.vmap(each, axes)
+    return each(*inputs)
 
 
 def _differentiate(primals: Any, tangents: Any, *, function: NativeFunction, batch: tuple[int, ...]) -> Any:
     outputs = _native.bind(*primals, function=function, batch=batch)
-    changes = jax.jvp(_plain(function, batch), tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))[1]
+    plain = partial(_plain, function=function, batch=batch)
+    changes = jax.jvp(plain, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))[1]
     return outputs, [ad.Zero(each.aval) if each.dtype == jax.float0 else each for each in changes]
 
 
@@ -210,7 +188,7 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
     if function.platform != platform or not function.ready():
         count_left("not built")
-        return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
+        return _lower_plain(context, *operands, function=function, batch=batch)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]
     return jax.ffi.ffi_lowering(function.name, operand_layouts=ins, result_layouts=outs)(context, *operands)
@@ -221,10 +199,7 @@ def _layout(rank: int, batched: int) -> tuple[int, ...]:
     return *reversed(range(batched)), *reversed(range(batched, rank))
 
 
-def _lower_plain(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) -> list[jax.Array]:
-    return _plain(function, batch)(*inputs)
-
-
+_lower_plain = mlir.lower_fun(_plain, multiple_results=True)
 _native = Primitive("native")
 _native.multiple_results = True
 _native.def_impl(_evaluate)
@@ -233,4 +208,4 @@ ad.primitive_jvps[_native] = _differentiate
 batching.primitive_batchers[_native] = _batch
 mlir.register_lowering(_native, partial(_lower, "cpu"), platform="cpu")
 mlir.register_lowering(_native, partial(_lower, "gpu"), platform="cuda")
-mlir.register_lowering(_native, mlir.lower_fun(_lower_plain, multiple_results=True))
+mlir.register_lowering(_native, _lower_plain)

@@ -2,9 +2,8 @@
 
 import itertools
 import math
-import typing
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -46,19 +45,10 @@ _KEEPS_SIGNED_ZEROS: Final = frozenset({"div", "max", "min", "mul", "neg", "sele
 _COMMUTATIVE: Final = frozenset({"add", "add_any", "and", "eq", "max", "min", "mul", "ne", "or"})
 
 
-T = TypeVar("T", bound=Callable[..., Any])
-
-
-def no_type_check(each: T) -> T:
-    """Exclude a function called for every entry from the tests' run-time type checks, which would slow it down."""
-    return typing.no_type_check(each)
-
-
 class TooLargeError(Exception):
     """The graph has too many scalars to be worth compiling."""
 
 
-@no_type_check
 class Node:
     """A scalar that depends on the inputs: an operation, with nodes and NumPy scalars as arguments.
 
@@ -75,7 +65,6 @@ class Node:
         self.parameters, self.dtype = parameters, dtype
 
 
-@no_type_check
 class ScalarGraph:
     """The operations of a function, without duplicates.
 
@@ -172,14 +161,18 @@ class ScalarGraph:
             found = value
             if value.number in self._sums:
                 differs = self.scalar(lax.ne_p, (value, value), np.dtype(bool))  # never, but no compiler knows
-                zero = self.scalar(lax.convert_element_type_p, (differs,), value.dtype, **_conversion(value.dtype))
-                found = self.scalar(lax.add_p, (value, zero), value.dtype)
+                found = self.scalar(lax.add_p, (value, self.converted(differs, value.dtype)), value.dtype)
             elif getattr(value.operation, "name", None) in _KEEPS_SIGNED_ZEROS:
                 arguments = tuple(map(self._signed, value.arguments))
                 if any(one is not other for one, other in zip(arguments, value.arguments, strict=True)):
                     found = self.scalar(value.operation, arguments, value.dtype, **value.parameters)
             self._from_zero[value.number] = found
         return self._from_zero[value.number]
+
+    def converted(self, value: Any, dtype: Any) -> Any:
+        """Return an entry as another type."""
+        parameters = {"new_dtype": dtype, "weak_type": False, "sharding": None}
+        return self.scalar(lax.convert_element_type_p, (value,), dtype, **parameters)
 
     def elementwise(self, primitive: Any, inputs: Sequence[np.ndarray], aval: Any, **parameters: Any) -> np.ndarray:
         spread = [np.broadcast_to(each, aval.shape).flat for each in inputs]
@@ -218,13 +211,11 @@ class ScalarGraph:
         return result
 
 
-@no_type_check
 def constants(value: Any) -> np.ndarray:
     array = np.asarray(value)
     return filled(array.shape, [array[index] for index in np.ndindex(array.shape)])
 
 
-@no_type_check
 def filled(shape: tuple[int, ...], entries: Iterable[Any]) -> np.ndarray:
     array = np.empty(math.prod(shape), object)
     for place, each in enumerate(entries):
@@ -232,12 +223,10 @@ def filled(shape: tuple[int, ...], entries: Iterable[Any]) -> np.ndarray:
     return array.reshape(shape)
 
 
-@no_type_check
 def entries_of(arrays: Iterable[np.ndarray]) -> list[Any]:
     return [each for array in arrays for each in array.flat]
 
 
-@no_type_check
 def _may_be_minus_zero(value: Any) -> bool:
     """Whether a sum or a term of it may be -0; squares are not, nor sums with them."""
     if not isinstance(value, Node):
@@ -251,21 +240,14 @@ def _may_be_minus_zero(value: Any) -> bool:
             return name not in ("abs", "square")
 
 
-def _conversion(dtype: Any) -> dict[str, Any]:
-    return {"new_dtype": dtype, "weak_type": False, "sharding": None}
-
-
-@no_type_check
 def _identity(value: Any) -> Any:
     return value.number if isinstance(value, Node) else (value.dtype.char, value.tobytes())
 
 
-@no_type_check
 def _is(value: Any, number: int) -> bool:
     return not isinstance(value, Node) and bool(value == number)
 
 
-@no_type_check
 def _folded(primitive: Any, arguments: tuple[Any, ...], dtype: Any, parameters: dict[str, Any]) -> Any:
     """Evaluate an operation on constants."""
     match primitive.name:
@@ -280,7 +262,6 @@ def _folded(primitive: Any, arguments: tuple[Any, ...], dtype: Any, parameters: 
         return dtype.type(np.asarray(primitive.bind(*map(jnp.asarray, arguments), **parameters)))
 
 
-@no_type_check
 def needed_for(outputs: Iterable[Any]) -> list[Node]:
     """Return the nodes that the outputs depend on, arguments first."""
     found: dict[int, Node] = {}
@@ -293,7 +274,6 @@ def needed_for(outputs: Iterable[Any]) -> list[Node]:
     return [found[number] for number in sorted(found)]
 
 
-@no_type_check
 def depth_first(outputs: Iterable[Any]) -> list[Node]:
     """The nodes of `needed_for` in another order: the arguments of each right before it, the deepest one first.
 
@@ -320,7 +300,6 @@ def depth_first(outputs: Iterable[Any]) -> list[Node]:
     return list(found.values())
 
 
-@no_type_check
 def _read_by(node: Node) -> list[Node]:
     """The arguments of a node that are nodes; of a loop only those that its passes read."""
     read = node.arguments

@@ -45,7 +45,7 @@ def python_source(function: ScalarFunction, passes: Passes | None = None) -> str
     items, inputs, outputs = writer.written(passes)
     text = _Text()
     lines = [*map(text.python, writer.loads.values()), *text.lines(items)]
-    forms = [[(size, np.dtype(kind).name, rank) for size, kind, rank in each] for each in (inputs, outputs)]
+    forms = [[(aval.size, aval.dtype.name, aval.ndim) for aval in each] for each in (inputs, outputs)]
     head = [BEGINNING, f"INPUTS, OUTPUTS = {forms[0]}, {forms[1]}"]
     known = [f"{name} = {value}" for value, name in text.constants.items()]
     known += [f"{name} = array({list(entries)}, {kind})" for (kind, entries), name in writer.constant_vectors.items()]
@@ -267,32 +267,17 @@ def _version() -> tuple[int, int]:
     return major, minor
 
 
-def _struct(name: str, **fields: Any) -> Any:
-    """A structure of XLA's interface: its size and extensions, and more."""
-    head = [("size", ctypes.c_size_t), ("extension", ctypes.c_void_p)]
-    return type(name, (ctypes.Structure,), {"_fields_": [*head, *fields.items()]})
+def _struct(**fields: Any) -> Any:
+    """A structure of XLA's interface, which begins with its size."""
+    return type("Structure", (ctypes.Structure,), {"_fields_": [("size", ctypes.c_size_t), *fields.items()]})
 
 
-_Buffer: Final = _struct(
-    "Buffer", kind=ctypes.c_int, data=ctypes.c_void_p, rank=ctypes.c_int64, dims=ctypes.POINTER(ctypes.c_int64)
-)
-_List: Final = _struct("List", count=ctypes.c_int64, kinds=ctypes.c_void_p, items=ctypes.POINTER(ctypes.c_void_p))
-_Error: Final = _struct("Error", message=ctypes.c_char_p, code=ctypes.c_int)
-_Version: Final = _struct("Version", major=ctypes.c_int, minor=ctypes.c_int)
-_Api: Final = _struct("Api", version=_Version, internal=ctypes.c_void_p, create=_HANDLER)
-_Frame: Final = _struct(
-    "Frame", api=ctypes.c_void_p, context=ctypes.c_void_p, stage=ctypes.c_int, inputs=_List, outputs=_List
-)
-
-
-class _Extension(ctypes.Structure):
-    _fields_ = (
-        ("size", ctypes.c_size_t),
-        ("kind", ctypes.c_int),
-        ("next", ctypes.c_void_p),
-        ("metadata", ctypes.c_void_p),
-    )
-
-
-class _Metadata(ctypes.Structure):
-    _fields_ = (("size", ctypes.c_size_t), ("version", _Version))
+_int, _long, _pointer = ctypes.c_int, ctypes.c_int64, ctypes.c_void_p
+_Buffer: Final = _struct(extension=_pointer, kind=_int, data=_pointer, rank=_long, dims=ctypes.POINTER(_long))
+_List: Final = _struct(extension=_pointer, count=_long, kinds=_pointer, items=ctypes.POINTER(_pointer))
+_Error: Final = _struct(extension=_pointer, message=ctypes.c_char_p, code=_int)
+_Version: Final = _struct(extension=_pointer, major=_int, minor=_int)
+_Api: Final = _struct(extension=_pointer, version=_Version, internal=_pointer, create=_HANDLER)
+_Frame: Final = _struct(extension=_pointer, api=_pointer, context=_pointer, stage=_int, inputs=_List, outputs=_List)
+_Extension: Final = _struct(kind=_int, next=_pointer, metadata=_pointer)
+_Metadata: Final = _struct(version=_Version)

@@ -5,7 +5,7 @@ either mode, in scans, batches and checkpoints.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Final
 
 import jax
@@ -13,9 +13,9 @@ import jax
 from mjx_study.graph.derivative_rule import Transpose, flat_with_rule, instantiated
 from mjx_study.graph.differentiation import NotDifferentiableError
 from mjx_study.graph.evaluation import written_out
-from mjx_study.graph.function import ScalarFunction
+from mjx_study.graph.function import MOST_KEPT, ScalarFunction
 from mjx_study.graph.linear_map import LinearMap, derivative
-from mjx_study.graph.native import as_native, count_left, native_identity
+from mjx_study.graph.native import POSTPONED, NativeFunction, count_left, native_identity, written
 
 MOST_DIFFERENTIATED: Final = 20_000
 """Maximum size of a linear map that is differentiated as a graph if JAX can do it, too."""
@@ -56,7 +56,7 @@ def computed(
         found = iter(applied(slope, primals, [changes[place] for place in moving]))
         return value, [next(found) if aval.dtype.kind == "f" else None for aval in function.avals]
 
-    program = _program(function, early)
+    program = _program(function, early, native_identity())
     return flat_with_rule(program, inputs, rule, transpose)
 
 
@@ -93,13 +93,13 @@ def applied(linear: LinearMap, point: Sequence[Any], changes: Sequence[Any], pla
     return computed(linear.push, [*point, *changes], transpose, along, early=linear.early)
 
 
-def _program(function: ScalarFunction, early: bool) -> Callable[..., list[jax.Array]]:
+@lru_cache(MOST_KEPT)
+def _program(function: ScalarFunction, early: bool, identity: str | None) -> Callable[..., list[jax.Array]]:
     """Native code where it can be built, else JAX operations."""
-    key = "program", native_identity()
-    if key not in function.derived:
-        used, native = function.used, None
-        if native_identity() is not None and used:
-            native = as_native(function.derived.get("values", function).of(used), function.of(used), early=early)
-        end = native or written_out(function.of(used))
-        function.derived[key] = lambda *inputs: end(*(inputs[place] for place in used))
-    return function.derived[key]
+    own, used, native = function.of(function.used), function.used, None
+    if identity is not None and used:
+        values = own.values or own
+        native = NativeFunction(lambda: written(values), own.types, own.avals, lambda: written_out(own), values)
+        native = native if not early or POSTPONED.get() or native.begun() else None
+    end = native or written_out(own)
+    return lambda *inputs: end(*(inputs[place] for place in used))

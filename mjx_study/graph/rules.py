@@ -1,4 +1,5 @@
-"""Rules for operations that move, sum or select entries of scalar arrays.
+"""Rules for operations that move, sum or select entries of scalar arrays, for sorting, and for factorisations and
+triangular systems, written out as the textbook algorithms.
 
 Each rule is a function (graph, inputs, aval of the output, parameters) -> outputs, or None to leave the operation as it
 is.
@@ -6,23 +7,21 @@ is.
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 
-from mjx_study.graph.algebra import ALGEBRA
 from mjx_study.graph.indexing import INDEXING
-from mjx_study.graph.nodes import ScalarGraph, constants, filled, no_type_check
+from mjx_study.graph.nodes import ScalarGraph, constants, filled
 
 Arrays = list[np.ndarray]
 Parameters = dict[str, Any]
 Rule = Callable[[ScalarGraph, Arrays, Any, Parameters], Arrays | None]
 
 
-@no_type_check
 def _broadcast(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     shape = [1] * len(aval.shape)
     for place, size in zip(parameters["broadcast_dimensions"], inputs[0].shape, strict=True):
@@ -30,13 +29,11 @@ def _broadcast(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parame
     return [np.broadcast_to(inputs[0].reshape(shape), aval.shape)]
 
 
-@no_type_check
 def _slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     bounds = parameters["start_indices"], parameters["limit_indices"], parameters["strides"] or (1,) * len(aval.shape)
     return [inputs[0][tuple(itertools.starmap(slice, zip(*bounds, strict=True)))]]
 
 
-@no_type_check
 def _pad(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     array, filler = inputs
     if any(low < 0 or high < 0 or between for low, high, between in parameters["padding_config"]):
@@ -47,7 +44,6 @@ def _pad(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) 
     return [padded]
 
 
-@no_type_check
 def _reduction(combine: Any) -> Rule:
     def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
         (array,), axes = inputs, parameters["axes"]
@@ -60,7 +56,6 @@ def _reduction(combine: Any) -> Rule:
     return rule
 
 
-@no_type_check
 def _place_of_extreme(better: Any) -> Rule:
     def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
         rows = np.moveaxis(inputs[0], parameters["axes"][0], -1)
@@ -76,7 +71,6 @@ def _place_of_extreme(better: Any) -> Rule:
     return rule
 
 
-@no_type_check
 def _one_minus_square(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     """(1 + x) (1 - x), an operation of its own from JAX 0.11 on."""
     one = constants(np.ones((), aval.dtype))
@@ -84,7 +78,6 @@ def _one_minus_square(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters:
     return [graph.elementwise(lax.mul_p, factors, aval)]
 
 
-@no_type_check
 def _cumsum(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     result = inputs[0].copy()
     rows = np.moveaxis(np.flip(result, parameters["axis"]) if parameters["reverse"] else result, parameters["axis"], 0)
@@ -94,19 +87,13 @@ def _cumsum(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameter
     return [result]
 
 
-@no_type_check
 def _dot(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     (over, batch), factors = parameters["dimension_numbers"], []
     for array, summed, shared in zip(inputs, over, batch, strict=True):
         free = [axis for axis in range(array.ndim) if axis not in (*summed, *shared)]
         sizes = [math.prod(array.shape[axis] for axis in axes) for axes in (shared, free, summed)]
-        kind = {"new_dtype": aval.dtype, "weak_type": False, "sharding": None}
         moved = array.transpose([*shared, *free, *summed]).reshape(sizes)
-        entries = [
-            each if each.dtype == aval.dtype else graph.scalar(lax.convert_element_type_p, (each,), aval.dtype, **kind)
-            for each in moved.flat
-        ]
-        factors.append(filled(tuple(sizes), entries))
+        factors.append(filled(tuple(sizes), [graph.converted(each, aval.dtype) for each in moved.flat]))
     left, right = factors[0][:, :, None], factors[1][:, None]
     terms = ShapedArray(np.broadcast_shapes(left.shape, right.shape), aval.dtype)
     products = graph.elementwise(lax.mul_p, [left, right], terms)
@@ -114,20 +101,113 @@ def _dot(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) 
     return [total.reshape(aval.shape)]
 
 
-@no_type_check
 def _reinterpreted(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     same = inputs[0].shape == aval.shape and aval.dtype != bool
     return [graph.elementwise(lax.bitcast_convert_type_p, inputs, aval, **parameters)] if same else None
 
 
+class _Arithmetic:
+    """Operations on scalars of one type."""
+
+    def __init__(self, graph: ScalarGraph, dtype: Any):
+        self._graph, self._dtype = graph, dtype
+
+    def less(self, value: Any, pairs: Sequence[tuple[Any, Any]]) -> Any:
+        """Subtract the products of pairs."""
+        for pair in pairs:
+            value = self.of(lax.sub_p, value, self.of(lax.mul_p, *pair))
+        return value
+
+    def of(self, primitive: Any, *arguments: Any) -> Any:
+        return self._graph.scalar(primitive, arguments, self._dtype)
+
+
+def _cholesky(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
+    """Lower factor; NaN where the matrix is not positive definite."""
+    scalars = _Arithmetic(graph, aval.dtype)
+    factors = constants(np.zeros(aval.shape, aval.dtype))
+    for at in np.ndindex(*aval.shape[:-2]):
+        matrix, lower = inputs[0][at], factors[at]
+        for j, i in itertools.combinations_with_replacement(range(len(matrix)), 2):
+            rest = scalars.less(matrix[i, j], list(zip(lower[i, :j], lower[j, :j], strict=True)))
+            lower[i, j] = scalars.of(lax.sqrt_p, rest) if i == j else scalars.of(lax.div_p, rest, lower[j, j])
+    return [factors]
+
+
+def _triangular_solve(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
+    """Solve op(A) X = B, or X op(A) = B as op(A)^T X^T = B^T, by substitution."""
+    scalars, left, unit = _Arithmetic(graph, aval.dtype), parameters["left_side"], parameters["unit_diagonal"]
+    matrices, right = inputs
+    turned = parameters["transpose_a"] == left
+    matrices = matrices.swapaxes(-1, -2) if turned else matrices
+    solutions = (right if left else right.swapaxes(-1, -2)).copy()
+    rows = range(matrices.shape[-1])
+    downwards = parameters["lower"] != turned
+    for at in np.ndindex(*matrices.shape[:-2]):
+        matrix, solution = matrices[at], solutions[at]
+        for i in rows if downwards else reversed(rows):
+            known = rows[:i] if downwards else rows[i + 1 :]
+            for column in range(solution.shape[1]):
+                rest = scalars.less(solution[i, column], [(matrix[i, k], solution[k, column]) for k in known])
+                solution[i, column] = rest if unit else scalars.of(lax.div_p, rest, matrix[i, i])
+    return [solutions if left else solutions.swapaxes(-1, -2)]
+
+
+def _sort(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
+    """Exchange neighbours that are out of order until none is; stable, with NaN last."""
+    axis, keys = parameters["dimension"], parameters["num_keys"]
+    arrays = [np.moveaxis(each, axis, 0).copy() for each in inputs]
+    size = len(arrays[0])
+    for row in np.ndindex(*arrays[0].shape[1:]):
+        for at in (at for end in range(size - 1, 0, -1) for at in range(end)):
+            _exchange(graph, arrays, (at + 1, *row), (at, *row), keys)
+    return [np.moveaxis(each, 0, axis) for each in arrays]
+
+
+def _top_k(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
+    """The k largest entries, each brought forward from the end, and their indices; the first of equal ones first."""
+    axis, k = parameters["axis"], parameters["k"]
+    entries = np.moveaxis(inputs[0], axis, 0).copy()
+    indices = constants(np.broadcast_to(np.arange(len(entries), dtype=np.int32), entries.T.shape).T.copy())
+    for row in np.ndindex(*entries.shape[1:]):
+        for at in (at for place in range(k) for at in range(len(entries) - 2, place - 1, -1)):
+            _exchange(graph, [entries, indices], (at + 1, *row), (at, *row), reverse=True)
+    return [np.moveaxis(each[:k], 0, axis) for each in (entries, indices)]
+
+
+def _exchange(graph, arrays, after, here, keys: int = 1, reverse: bool = False) -> None:
+    """Exchange two entries of arrays if the keys, the first arrays, of the second come before those of the first."""
+    ordered = [[each[at] for each in arrays[:keys]] for at in (after, here)]
+    swap = _precedes(graph, *(reversed(ordered) if reverse else ordered))
+    for each in arrays:
+        low, high = each[here], each[after]
+        each[here] = graph.scalar(lax.select_n_p, (swap, low, high), low.dtype)
+        each[after] = graph.scalar(lax.select_n_p, (swap, high, low), low.dtype)
+
+
+def _precedes(graph: ScalarGraph, one: Sequence[Any], other: Sequence[Any]) -> Any:
+    """Whether a vector of keys comes before another in lexicographic order."""
+    logic = _Arithmetic(graph, np.dtype(bool))
+    (a, *rest_a), (b, *rest_b) = one, other
+    before = logic.of(lax.lt_p, a, b)
+    if a.dtype.kind == "f":
+        numbers = logic.of(lax.and_p, logic.of(lax.eq_p, a, a), logic.of(lax.ne_p, b, b))
+        before = logic.of(lax.or_p, before, numbers)
+    if not rest_a:
+        return before
+    after = _precedes(graph, other[:1], one[:1])
+    later = logic.of(lax.and_p, logic.of(lax.not_p, after), _precedes(graph, rest_a, rest_b))
+    return logic.of(lax.or_p, before, later)
+
+
 RULES: Final[dict[str, Rule]] = {
-    **ALGEBRA,
     **INDEXING,
     **dict.fromkeys(("squeeze", "reshape", "expand_dims"), lambda _, inputs, aval, __: [inputs[0].reshape(aval.shape)]),
     "argmax": _place_of_extreme(lax.gt_p),
     "argmin": _place_of_extreme(lax.lt_p),
     "bitcast_convert_type": _reinterpreted,
     "broadcast_in_dim": _broadcast,
+    "cholesky": _cholesky,
     "concatenate": lambda _, inputs, __, parameters: [np.concatenate(inputs, parameters["dimension"])],
     "cumsum": _cumsum,
     "dot_general": _dot,
@@ -143,11 +223,14 @@ RULES: Final[dict[str, Rule]] = {
     "reduce_sum": _reduction(lax.add_p),
     "rev": lambda _, inputs, __, parameters: [np.flip(inputs[0], parameters["dimensions"])],
     "slice": _slice,
+    "sort": _sort,
     "split": lambda _, inputs, __, parameters: np.split(
         inputs[0], np.cumsum(parameters["sizes"])[:-1], parameters["axis"]
     ),
     "stack": lambda _, inputs, __, parameters: [np.stack(inputs, parameters["axis"])],
     "tile": lambda _, inputs, __, parameters: [np.tile(inputs[0], parameters["reps"])],
+    "top_k": _top_k,
+    "triangular_solve": _triangular_solve,
     "unstack": lambda _, inputs, __, parameters: list(np.moveaxis(inputs[0], parameters["axis"], 0)),
     "transpose": lambda _, inputs, __, parameters: [inputs[0].transpose(parameters["permutation"])],
 }

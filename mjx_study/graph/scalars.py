@@ -7,6 +7,7 @@ folds constants, eliminates common subexpressions, and drops what no output need
 act on contiguous arrays over the batch under `vmap`, and fuse.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -15,9 +16,9 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from mjx_study.graph.function import ScalarFunction, capture, is_input
+from mjx_study.graph.function import MOST_KEPT, ScalarFunction, capture, is_input
 from mjx_study.graph.native import count_left, native_identity
-from mjx_study.graph.nodes import TooLargeError, no_type_check
+from mjx_study.graph.nodes import TooLargeError
 from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
@@ -27,8 +28,6 @@ MOST_NATIVE: Final = 100_000
 
 _CAPTURED: Final[dict[Any, ScalarFunction | None]] = {}
 """Graphs, keyed by everything they depend on; None if too large."""
-MOST_KEPT: Final = 64
-"""Maximum number of graphs in `_CAPTURED`."""
 
 
 def unrolled(function: Callable[..., Any], *arguments: Any, otherwise: Callable[..., Any] | None = None) -> Any:
@@ -56,7 +55,8 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
             captured = capture(function, *arguments, most=2 * most)
             captured = captured if is_small(captured) else None
             if captured and any(node.operation == "whole" for node in captured.needed):
-                captured.derived["values"] = capture(function, *arguments, most=2 * most, values_only=True)
+                values = capture(function, *arguments, most=2 * most, values_only=True)
+                captured = dataclasses.replace(captured, values=values)
         except TooLargeError:
             captured = _left()
         _CAPTURED[key] = captured
@@ -81,14 +81,13 @@ def most_scalars() -> int:
     return MOST_SCALARS[jax.default_backend()] if native_identity() is None else MOST_NATIVE
 
 
-def _name(function: Callable[..., Any]) -> Any:
-    """Key shared by partials of the same function and arguments."""
+def _name(function: Any) -> Any:
+    """Key shared by partials of the same function and arguments, which may be partials, too."""
     if isinstance(function, partial):
-        return function.func, function.args, tuple(sorted(function.keywords.items()))
+        return _name(function.func), tuple(map(_name, function.args)), tuple(sorted(function.keywords.items()))
     return function
 
 
-@no_type_check
 def _content(leaf: Any) -> Any:
     """Return what a graph depends on: the type of traced leaves, the value of others."""
     if is_input(leaf):

@@ -88,7 +88,7 @@ def _natively(left: set[int], equation: Any, inputs: Sequence[Any]) -> Sequence[
     """
     name, inner = equation.primitive.name, equation.params.get("jaxpr")
     if name == "scan":
-        length, maps = equation.params["length"], not equation.params["num_carry"]
+        length, maps = equation.params["length"], not scan_inputs(equation, inputs)[1]
         stays = maps and length in left and jax.default_backend() == "cpu"
         if not stays and (loop := _native_scan(equation, inputs)) is not None:
             return loop

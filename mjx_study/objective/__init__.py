@@ -7,19 +7,12 @@ program on one device, so that devices leave the solver's loop independently. Th
 the devices, and neither do the bits of the result.
 """
 
-from mjx_study.objective.batches import (
-    BlankObjective,
-    MjxObjective,
-    Simulator,
-    TracedObjective,
-    compiled_rollout,
-    contact_for,
-)
+from mjx_study.objective.batches import BlankObjective, MjxObjective, Simulator, TracedObjective, compiled_rollout
 from mjx_study.objective.chunks import MAX_CHUNK, chunk_for, natively, spread
 from mjx_study.objective.cost import rollout_cost, simulate
 from mjx_study.objective.programs import SamplePrograms
 
 __all__ = [
     "BlankObjective", "MAX_CHUNK", "MjxObjective", "SamplePrograms", "Simulator", "TracedObjective", "chunk_for",
-    "compiled_rollout", "contact_for", "natively", "rollout_cost", "simulate", "spread",
+    "compiled_rollout", "natively", "rollout_cost", "simulate", "spread",
 ]  # fmt: skip

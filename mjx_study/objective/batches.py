@@ -68,7 +68,7 @@ class Simulator:
 
     def memory(self, kind: str, contact: ContactModel | None, samples: int) -> int:
         """XLA's planned temporary memory [bytes] for a batch of one kind, all chunks at once on all devices."""
-        arguments = self._chunk(self.task.theta, contact_for(kind, contact), 1.0)
+        arguments = self._chunk(kind, self.task.theta, contact, 1.0)
         ready: Any = self._programs[kind].executable(*arguments)
         built = ready if isinstance(ready, jax.stages.Compiled) else ready.lower(*arguments).compile()
         plan: Any = built.memory_analysis()
@@ -82,7 +82,7 @@ class Simulator:
             raise ValueError(f"theta has shape {theta.shape}, the policy needs ({self.task.policy.num_params},)")
         if len(noise_scale) == 0:
             raise ValueError("there are no samples to run: give at least one key")
-        shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
+        shared = theta, _contact_for(name, contact), np.asarray(sigma, self.task.scene.template.qpos.dtype)
         return jax.block_until_ready(
             spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, self.devices)
         )
@@ -93,23 +93,23 @@ class Simulator:
         Those of gradients follow from those of values: what takes both can be compiled before gradients are traced.
         """
         if name in ("gradient", "corrected"):
-            value, score, residual = self.form("value", theta, contact_for("value", contact), sigma)
+            value, score, residual = self.form("value", theta, contact, sigma)
             corrected = name == "corrected" or self.task.onset != "none"
             shape = self.chunk_size, len(dataclasses.fields(OnsetCounts))
             return value, score, residual, jax.ShapeDtypeStruct(shape, float) if corrected else None
-        arguments = self._chunk(theta, contact, sigma)
+        arguments = self._chunk(name, theta, contact, sigma)
         return self._programs[name].outputs(*arguments, platform=self.devices[0].platform)
 
     def build(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, builds: Builds) -> None:
         """Trace one of `SamplePrograms` and begin to compile it, where all devices share one program."""
         if self.devices[0].platform == "cpu":
-            builds.start(self._programs[name], *self._chunk(theta, contact_for(name, contact), sigma))
+            builds.start(self._programs[name], *self._chunk(name, theta, contact, sigma))
 
-    def _chunk(self, theta: Any, contact: ContactModel | None, sigma: Any) -> tuple[Any, ...]:
+    def _chunk(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any) -> tuple[Any, ...]:
         """Program arguments for a chunk of identical samples, with the shapes of any chunk."""
         dtype = self.task.scene.template.qpos.dtype
         keys = np.zeros((self.chunk_size, 2), np.uint32)
-        return theta, contact, np.asarray(sigma, dtype), keys, np.ones(self.chunk_size, dtype)
+        return theta, _contact_for(name, contact), np.asarray(sigma, dtype), keys, np.ones(self.chunk_size, dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,8 +232,7 @@ class MjxObjective:
         # Raw key data, since sharing noise among several rollouts is intended rather than reuse of a key.
         key_data = np.asarray(jax.random.key_data(keys))[rows]
         dtype = self.simulator.task.scene.template.qpos.dtype
-        contact = contact_for(name, self.contact)
-        return self.simulator.run(name, theta, contact, self.sigma, key_data, scale.astype(dtype))
+        return self.simulator.run(name, theta, self.contact, self.sigma, key_data, scale.astype(dtype))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -250,7 +249,7 @@ class BlankObjective(MjxObjective):
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
         self.programs[name] = None
         rows = np.arange(len(keys)) if rows is None else rows
-        made = self.simulator.form(name, theta, contact_for(name, self.contact), self.sigma)
+        made = self.simulator.form(name, theta, self.contact, self.sigma)
         return jax.tree.map(lambda leaf: np.zeros((len(rows), *leaf.shape[1:]), leaf.dtype), made)
 
 
@@ -280,7 +279,7 @@ class TracedObjective(MjxObjective):
             chunks, back = order[chunks], np.argsort(order)
         key_data, sigma = jax.random.key_data(keys), jnp.asarray(self.sigma, dtype)
         kept = simulator._programs[name]
-        blank = simulator._chunk(theta, None, 1.0)[-2:]
+        blank = simulator._chunk(name, theta, None, 1.0)[-2:]
         program = kept.jitted if self.batched else kept.within(theta, self.contact, sigma, *blank)
 
         def call(chunk):
@@ -320,7 +319,7 @@ def _numpy_of(array: Any) -> Any:
     return np if isinstance(array, np.ndarray) else jnp
 
 
-def contact_for(name: str, contact: ContactModel | None) -> ContactModel | None:
+def _contact_for(name: str, contact: ContactModel | None) -> ContactModel | None:
     """Drop a contact model's surrogate for programs without derivatives, so that one program serves all models."""
     if contact is None or name not in ("value", "steps"):
         return contact

@@ -99,11 +99,19 @@ def simulate(
         key: key of the sample; draws the initial state and noise as in a batch.
         noise_scale: factor of the noise; 0 for a zero-noise rollout.
     """
-    start_key, noise_key = split_sample_key(key)
-    standard = standard_noise(noise_key, task.policy.noise_shape, theta.dtype, task.noise, normal)
-    noise = noise_scale * task.sigma * standard
-    cost, (states, controls, residual, _) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
+    start, noise = drawn(task, key, task.sigma, noise_scale)
+    cost, (states, controls, residual, _) = rollout_cost(task, theta, contact, start, noise)
     return states, controls, cost, residual
+
+
+def drawn(
+    task: Task, key: Key[Array, ""], sigma: float | Float[Array, ""], noise_scale: float | Float[Array, ""]
+) -> tuple[State, Float[Array, "steps dimensions"]]:
+    """Initial state and noise of a sample, from its key, the noise's standard deviation and a factor."""
+    start_key, noise_key = split_sample_key(key)
+    dtype = task.scene.template.qpos.dtype
+    standard = standard_noise(noise_key, task.policy.noise_shape, dtype, task.noise, normal)
+    return task.draw_start(start_key), noise_scale * sigma * standard
 
 
 def before_each_step(states: State) -> State:

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from estimators.noise import noise_score, split_sample_key, standard_noise
-from mjx_study.graph.random import normal
-from mjx_study.objective.cost import before_each_step, derivative_model, last_of, rollout_cost
+from estimators.noise import noise_score
+from mjx_study.objective.cost import before_each_step, derivative_model, drawn, last_of, rollout_cost
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.onset import as_row
@@ -38,11 +37,7 @@ class SamplePrograms:
         }
 
     def draw(self, sigma, key_data, noise_scale) -> tuple[State, Float[Array, "steps dimensions"]]:
-        task = self.task
-        start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
-        dtype = task.scene.template.qpos.dtype
-        standard = standard_noise(noise_key, task.policy.noise_shape, dtype, task.noise, normal)
-        return task.draw_start(start_key), noise_scale * sigma * standard
+        return drawn(self.task, jax.random.wrap_key_data(key_data), sigma, noise_scale)
 
     def cost(self, theta, contact, sigma, key_data, noise_scale, onset="none"):
         """Cost of one rollout, with its states, controls, noise, largest solver residual and onset counts."""

@@ -8,18 +8,22 @@ import dataclasses
 import itertools
 from collections import ChainMap, Counter
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any, Final, Protocol, Union, runtime_checkable
+from dataclasses import MISSING
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Union, runtime_checkable
 
 from estimators.choices import DENSITIES
-from estimators.registry import ESTIMATORS
+from estimators.registry import ESTIMATORS, options_of_estimators
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS
-from mjx_study.options.estimator_options import of_estimators, with_options_of_estimators
-from mjx_study.options.option import MAX_VALUES, OptionError, Rows, declared, options_of
-from mjx_study.options.rules import check_span, reject_untaken
+from mjx_study.options.option import MAX_VALUES, OptionError, Rows, check_span, declared, options_of, reject_untaken
 
 if TYPE_CHECKING:
     import estimators.estimator
 
+Config = TypeVar("Config")
+ESTIMATOR_OPTIONS: Final = {name: field for name, field in options_of_estimators().items() if name != "sigma"}
+"""Options that estimators declare, by name; `sigma` is that of the noise."""
+REQUIRED_OPTIONS: Final = tuple(name for name, field in ESTIMATOR_OPTIONS.items() if field.default is MISSING)
+"""Those without which an estimator that has them cannot be made."""
 CONTACTS: Final[Collection[str]] = ChainMap[str, Any]({REFERENCE: None}, FAMILIES)
 """Contact families of a study, those added later included, and the analytic reference."""
 UNSET_TASK: Final = "the task's"
@@ -48,6 +52,25 @@ SCENE_OPTIONS: Final = {
 arguments of `load_scene` that they set."""
 BUILDER_OPTIONS: Final = ("horizon", "model", *SCENE_OPTIONS)
 """Options passed to the builder of a task."""
+
+
+def of_estimators(name: str, **changes: Any) -> Any:
+    """Declare an option as the estimators that have it do, with changes."""
+    field = ESTIMATOR_OPTIONS[name]
+    about = {"default": None if field.default is MISSING else field.default, **field.metadata} | changes
+    about.pop("example")
+    return declared(**about)
+
+
+def with_options_of_estimators(configuration: type[Config]) -> type[Config]:
+    """Add the options that estimators declare and a configuration does not; None for an estimator's default."""
+    for name, field in ESTIMATOR_OPTIONS.items():
+        if name not in configuration.__annotations__:
+            kind: Any = field.type
+            configuration.__annotations__[name] = kind | None
+            usual = "" if field.default is MISSING else str(field.default)
+            setattr(configuration, name, of_estimators(name, default=None, unset=usual))
+    return configuration
 
 
 @runtime_checkable

@@ -2,7 +2,9 @@
 
 import dataclasses
 import hashlib
+import io
 import json
+import math
 import tomllib
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
@@ -18,24 +20,12 @@ from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS
 from mjx_study.options.option import OptionError
 
 POLICY_OPTIONS: Final = (
-    "contact",
-    "stiffness",
-    "damping",
-    "smoothing",
-    "timestep",
-    "cone",
-    "network",
+    *("contact", "stiffness", "damping", "smoothing", "timestep", "cone", "network"),
     *BUILDER_OPTIONS,
 )
 """Options under which a policy was found."""
-
-
-@dataclasses.dataclass(frozen=True)
-class SavedPolicy:
-    """Task of a policy written by `optimise`, and those of `POLICY_OPTIONS` under which it was found."""
-
-    task: str
-    options: Mapping[str, Any]
+HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+"""Readers of .npy headers, by version of the format."""
 
 
 @cache
@@ -82,24 +72,27 @@ def read_toml(path: Path) -> dict[str, Any]:
         return {name: OPTIONS[name].read(value) for name, value in found.items()}
 
 
-def read_theta(path: Path) -> tuple[tuple[float, ...], SavedPolicy | None]:
-    """Read parameters from a policy file, which is returned as well, a .json list or a .npy array; else ValueError."""
+def read_theta(path: Path) -> tuple[tuple[float, ...], dict[str, Any]]:
+    """Read parameters from a policy file, a .json list or a .npy array; else ValueError.
+
+    Of a policy written by `optimise`, its task and those of `POLICY_OPTIONS` under which it was found are returned too.
+    """
     if path.suffix != ".json":
-        return _read_array(path), None
+        return _read_array(path), {}
     content = read_bytes(path)
     with _naming_file(path):
         try:
             found = json.loads(content)
         except (ValueError, RecursionError) as error:
             raise ValueError(f"not JSON: {error}") from None
-        policy = _policy_of(found) if isinstance(found, dict) else None
-        theta = OPTIONS["theta"].check(found if policy is None else found.get("theta"))
+        policy = _policy_of(found) if isinstance(found, dict) else {}
+        theta = OPTIONS["theta"].check(found.get("theta") if policy else found)
         if not theta:
             raise ValueError("there are no parameters")
         return tuple(map(float, theta)), policy
 
 
-def _policy_of(document: dict[str, Any]) -> SavedPolicy:
+def _policy_of(document: dict[str, Any]) -> dict[str, Any]:
     if document.get("digest") not in (None, digest_of_json(document)):
         raise ValueError("the digest does not match, so the file is damaged; if you changed it, remove its digest")
     if not isinstance(task := document.get("task"), str):
@@ -109,7 +102,7 @@ def _policy_of(document: dict[str, Any]) -> SavedPolicy:
         del options["stiffness"]
     for name, value in options.items():
         dataclasses.replace(OPTIONS[name], many=name in ("network", "disable_flag")).check(value)
-    return SavedPolicy(task, options)
+    return options | {"task": task}
 
 
 @contextmanager
@@ -123,17 +116,26 @@ def _naming_file(path: Path) -> Generator[None]:
 
 
 def _read_array(path: Path) -> tuple[float, ...]:
-    magic = read_bytes(path)[:6]
+    content = read_bytes(path)
     try:
-        if magic != np.lib.format.MAGIC_PREFIX:
-            raise ValueError("not a .npy file")
-        array = np.load(path, mmap_mode="r", allow_pickle=False)  # does not allocate an impossible shape
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-            raise ValueError("not an array of numbers")
+        array = read_npy(content)
         with np.errstate(over="ignore"):
             values = np.asarray(array, float)  # in which a long double may be infinite
-        if not np.all(np.isfinite(values)):
-            raise ValueError("not finite")
-        return tuple(values.reshape(-1).tolist())
+        if array.dtype.kind not in "fiu" or not np.all(np.isfinite(values)):
+            raise ValueError("not an array of finite numbers")
     except Exception as error:  # numpy may raise anything
         raise ValueError(f"{path} is not a .npy array of finite numbers") from error
+    return tuple(values.reshape(-1).tolist())
+
+
+def read_npy(content: bytes) -> np.ndarray:
+    """Read a .npy file, read-only; ValueError unless its header promises as many bytes as follow."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    if version not in HEADERS:
+        raise ValueError(f"an array is in version {'.'.join(map(str, version))} of NumPy's format")
+    shape, by_column, dtype = HEADERS[version](stream)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
+        raise ValueError("an array differs in size from its header")
+    flat = np.frombuffer(content, dtype, offset=stream.tell()) if dtype.itemsize else np.zeros(math.prod(shape), dtype)
+    return flat.reshape(shape, order="F" if by_column else "C")

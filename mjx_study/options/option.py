@@ -1,14 +1,16 @@
 """Options: declared as fields of a configuration, and checked alike in text, in files and in Python."""
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Collection, Generator, Iterable
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any, Final, get_args, get_origin
 
 from estimators.choices import suggestion
 from estimators.intervals import Interval, plain, short
+from mjx_study.choices import REFERENCE, laws_of, takes_stiffness
 
 KINDS: Final[dict[type, tuple[type, str]]] = {
     bool: (bool, "true or false"),
@@ -99,7 +101,12 @@ class Option:
                 return self.check(self.read_rows(text))
             if self.many:
                 parts = [part.strip() for part in text.split(",") if part.strip()]
-                return self.check(tuple(each for part in parts for each in self._parse_part(part)))
+                ranges = self.kind is not str
+                lists = [
+                    expand_range(each, self.kind) if ranges and ":" in each else [self._parse_one(each)]
+                    for each in parts
+                ]
+                return self.check(tuple(itertools.chain(*lists)))
             return self.check(self._parse_one(text))
 
     def read(self, value: Any) -> Any:
@@ -115,13 +122,9 @@ class Option:
     def describe(self) -> str:
         """Return the help text: line, unit and default."""
         default = ",".join(map(str, self.default)) if isinstance(self.default, tuple) else self.default
-        shown = (
-            self.unset
-            if default is None or self.kind is bool
-            else f"{default:g}"
-            if isinstance(default, float)
-            else str(default)
-        )
+        shown = self.unset
+        if default is not None and self.kind is not bool:
+            shown = f"{default:g}" if isinstance(default, float) else str(default)
         line = self.line.format(", ".join(self.choices))
         return line + (f" [{self.unit}]" if self.unit else "") + (f" (default: {shown})" if shown else "")
 
@@ -159,9 +162,6 @@ class Option:
         if self.kind is not str and text.strip() not in self.choices:
             return parse_number(text.strip(), self.kind)
         return text.lower() if text.lower() in self.choices else text  # MuJoCo writes RK4, Newton
-
-    def _parse_part(self, text: str) -> list[Any]:
-        return [self._parse_one(text)] if self.kind is str or ":" not in text else expand_range(text, self.kind)
 
     def _typed(self, value: Any) -> Any:
         if isinstance(value, list | tuple):
@@ -236,3 +236,29 @@ def expand_range(text: str, kind: type) -> list[Any]:
         inner = [float(f"{start + share * (stop - start):.12g}") for share in shares]
     values = [start, *inner[1:-1], stop]
     return [int(value) if kind is int and value.is_integer() else value for value in values]
+
+
+def check_span(span: Sequence[float] | None) -> None:
+    """Raise OptionError unless span is None or two numbers in ascending order."""
+    if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
+        raise OptionError("span", "must be two numbers, the lower one first; got " + ", ".join(map(str, span)))
+
+
+def reject_untaken(families: Sequence[str], *, stiffness: object, damping: object, smoothing: object = None) -> None:
+    """Raise OptionError for a stiffness, damping or smoothing, not None, that none of the contact families takes."""
+    if smoothing is not None and not laws_of(families):
+        raise OptionError("smoothing", "has no effect on MuJoCo's law: omit it, or add a family such as hunt_crossley")
+    undamped = [family for family in families if family != REFERENCE]
+    for name, value, able in (("stiffness", stiffness, families), ("damping", damping, undamped)):
+        if value is not None and not takes_stiffness(able):
+            chosen = f"contact {', '.join(families)}" if families else "solref or solimp alone"
+            raise OptionError(name, f"has no effect on {chosen}: omit it, or add a family that takes one, e.g. mujoco")
+
+
+def reject_unused(given: Collection[str], *uses: tuple[Iterable[str], bool, str]) -> None:
+    """Raise OptionError for the first option that was given and has no effect; `uses` are names of options, whether
+    they have one, and the reason if they have none."""
+    for names, used, reason in uses:
+        for name in names:
+            if name in given and not used:
+                raise OptionError(name, reason)

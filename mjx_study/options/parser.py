@@ -10,8 +10,7 @@ from typing import Any, Final, NoReturn
 
 from estimators.choices import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
-from mjx_study.options.configuration import BUILDER_OPTIONS, CONTACTS, OPTIONS, UNSET_TASK
-from mjx_study.options.estimator_options import ESTIMATOR_OPTIONS
+from mjx_study.options.configuration import BUILDER_OPTIONS, CONTACTS, ESTIMATOR_OPTIONS, OPTIONS, UNSET_TASK
 from mjx_study.options.option import Option, OptionError, flag_of
 
 SIMILAR_FLAGS: Final = 0.75

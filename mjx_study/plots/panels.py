@@ -75,10 +75,6 @@ def model_title(one: xr.Dataset, between: str = ", ") -> str:
     return TITLES.get(family, family) + (f"{between}{number(stiffness)}\N{NO-BREAK SPACE}N/m" if stiffness > 0 else "")
 
 
-def positions(rows: xr.Dataset) -> np.ndarray:
-    return np.where(rows["stiffness"].values > 0, rows["stiffness"].values, NO_CONTACT)
-
-
 def families(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
     """Contact models by family, in order of stiffness; families of a single stiffness grouped at the end."""
     contact = part["contact"].values
@@ -113,7 +109,7 @@ def stiffness_axis(axes: Axes, family: str, rows: xr.Dataset) -> np.ndarray:
     if family:
         axes.set(xscale="log", xlabel=COORDINATES["stiffness"].label)
         axes.set_title(TITLES.get(family, family), fontsize="medium")
-        return positions(rows)
+        return np.where(rows["stiffness"].values > 0, rows["stiffness"].values, NO_CONTACT)
     x = np.arange(rows.sizes["model"], dtype=float)
     labels = [model_title(rows.isel(model=index), ",\n") for index in range(len(x))]
     turned = {"rotation": 20, "ha": "right"} if len(x) > 1 else {}

@@ -24,8 +24,7 @@ Values = Float[np.ndarray, "*batch"]
 Points = Float[np.ndarray, "*batch params"]
 Theta = Float[np.ndarray, " params"]
 
-TAIL_PROBABILITY: Final = 1e-15
-"""Probability of noise outside the range of the quadrature."""
+TAIL_PROBABILITY: Final = 1e-15  # probability of noise outside the range of the quadrature
 NODES: Final = np.polynomial.legendre.leggauss(64)
 """Nodes on (-1, 1) and weights of the Gauss-Legendre rule between adjacent cuts."""
 CORE, PANEL, GROWTH = 8.0, 0.5, 1.25

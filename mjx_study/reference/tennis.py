@@ -32,16 +32,13 @@ from jaxtyping import Array, Float, Int, Key
 
 from mjx_study.reference.system import ControlJacobians, Controls, Costs, QuadraticCost, StateJacobians, States
 
-MAX_TURNED: Final = 1e-3
-"""Bound on the deviation of a velocity that was not reflected [rad]."""
+MAX_TURNED: Final = 1e-3  # bound on the deviation of a velocity that was not reflected [rad]
 MAX_IMPACTS: Final = 4
 """Maximum number of impacts per step; a ball still approaching the paddle afterwards passes through."""
-CONTROL_SLOPE: Final = np.eye(3, 10, 7)
-"""Derivative of the control with respect to (state, control)."""
+CONTROL_SLOPE: Final = np.eye(3, 10, 7)  # derivative of the control with respect to (state, control)
 SUBDIVISIONS: Final = 8
 """Number of parts of a flight searched for a crossing; entry and exit within one part (a graze) are missed."""
-BISECTIONS: Final = 60
-"""Bisections of such a part, down to adjacent floating-point numbers."""
+BISECTIONS: Final = 60  # bisections of such a part, down to adjacent floating-point numbers
 TOUCHING_DEPTH: Final = 1e-9
 """Depth inside a face that still counts as outside [m], for rounding after an impact at the end of a step."""
 

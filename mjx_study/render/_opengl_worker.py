@@ -12,8 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-FINER = 3
-"""Supersampling factor along each axis, for smooth edges."""
+FINER = 3  # supersampling factor along each axis, for smooth edges
 
 
 def main(folder: Path) -> None:

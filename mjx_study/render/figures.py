@@ -22,13 +22,10 @@ from mjx_study.render.drawing import Drawing
 from mjx_study.render.motion import Motion, resolve_view
 from mjx_study.render.opengl import RenderError, images
 
-MAX_FILM_FRAMES: Final = 120
-"""Maximum number of frames in a film; longer ones have fewer per second."""
+MAX_FILM_FRAMES: Final = 120  # maximum number of frames in a film; longer ones have fewer per second
 FRAMES_PER_SECOND: Final = 25
-LAST_FRAME: Final = 0.5
-"""Extra time for the last frame [s], so that a loop ends visibly."""
-MAX_GIF_BYTES: Final = 1_000_000
-"""Size of a GIF above which its pictures are made smaller [bytes]."""
+LAST_FRAME: Final = 0.5  # extra time for the last frame [s], so that a loop ends visibly
+MAX_GIF_BYTES: Final = 1_000_000  # size of a GIF above which its pictures are made smaller [bytes]
 _WIDTH: Final = 9.0  # of a strip [inches]
 _GAP: Final = 0.14
 _LEFT, _RIGHT, _BOTTOM, _TITLE = 0.68, 0.12, 0.5, 0.24

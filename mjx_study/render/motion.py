@@ -15,8 +15,7 @@ VISIBLE_GROUPS = 3
 """Geom groups that MuJoCo's viewers show by default (0, 1 and 2); collision geometry is usually in 3 and above."""
 DEFAULT_RGBA: Final = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 """MuJoCo's default geom colour, the only one that a material's colour overrides."""
-CORNERS: Final = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
-"""Corners of a box with half sides 1."""
+CORNERS: Final = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T  # corners of a box with half sides 1
 _SAMPLED_TIMES: Final = 100
 _SURROUNDINGS: Final = 0.35  # distance around the motion within which fixed geoms are shown, over the larger side
 _MARGIN: Final = 0.06  # relative to the larger side

@@ -107,17 +107,21 @@ def _elliptic_force(model: mjx.Model, rows: Any, slack: Rows, linear: Rows, forc
     return force
 
 
+def row_forces_at(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Rows:
+    """Force of each constraint row [N or N m] at the acceleration `qacc`."""
+    rows: Any = data._impl
+    return row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
+
+
 def constraint_force(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Qvel:
     """Joint-space constraint force J^T f(J a - aref) [N or N m] at the acceleration `qacc`."""
     rows: Any = data._impl
-    return rows.efc_J.T @ row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
+    return rows.efc_J.T @ row_forces_at(model, data, qacc)
 
 
 def with_forces(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> mjx.Data:
     """The data with an acceleration, and with the force of every constraint row at it."""
-    rows: Any = data._impl
-    forces = row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
-    found: Any = data.tree_replace({"qacc": qacc, "_impl.efc_force": forces})
+    found: Any = data.tree_replace({"qacc": qacc, "_impl.efc_force": row_forces_at(model, data, qacc)})
     return found
 
 

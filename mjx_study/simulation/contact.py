@@ -144,16 +144,15 @@ def family_model(
     if law is not None:
         law.check(scene)
     if family.solref is not None:
-        return dataclasses.replace(contact_model(family.solref, family.solimp, scene=scene), law=law)
-    if stiffness is None:
+        solref = family.solref
+    elif stiffness is None:
         raise ValueError(f"contact family {name!r} needs a stiffness in N/m")
-    if law is not None:
-        given = law.solref(stiffness, damping, effective_mass=effective_mass, d_width=family.solimp[1], edges=edges)
-        return dataclasses.replace(contact_model(given, family.solimp, scene=scene), law=law)
-    solref = solref_from_stiffness(
-        stiffness, damping, effective_mass=effective_mass, dampratio=family.dampratio if damping is None else None
-    )
-    return contact_model(solref, family.solimp, scene=scene)
+    elif law is not None:
+        solref = law.solref(stiffness, damping, effective_mass=effective_mass, d_width=family.solimp[1], edges=edges)
+    else:
+        dampratio = family.dampratio if damping is None else None
+        solref = solref_from_stiffness(stiffness, damping, effective_mass=effective_mass, dampratio=dampratio)
+    return dataclasses.replace(contact_model(solref, family.solimp, scene=scene), law=law)
 
 
 def solref_from_stiffness(

@@ -138,10 +138,9 @@ def solver_residual(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
 
 
 def _solve(solver: constraint.Solver, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    qacc = constraint.solve(model, data, solver)
+    data = constraint.with_forces(model, data, constraint.solve(model, data, solver))
     rows: Any = data._impl
-    force = constraint.row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
-    return data.replace(qacc=qacc, qfrc_constraint=rows.efc_J.T @ force, _impl=rows.replace(efc_force=force))
+    return data.replace(qfrc_constraint=rows.efc_J.T @ rows.efc_force)
 
 
 _SOLVE: Final[Replacements] = {

@@ -163,7 +163,11 @@ def _step_of_law(scene: Scene, model: LawModel, state: State, control: Control) 
 
 def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Control) -> mjx.Data:
     """Run a step up to the constraint solve: kinematics, contacts, forces, constraint rows."""
-    return force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
+    return _forced(scene, model, state.qpos, state.qvel, state.act, control)
+
+
+def _forced(scene: Scene, model: mjx.Model, qpos: Qpos, qvel: Qvel, act: Act, control: Control) -> mjx.Data:
+    return force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
 
 
 def solved_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, guards.Course]:
@@ -184,22 +188,22 @@ def _solved(solver: constraint.Solver, scene: Scene, model: mjx.Model, state: St
     return State(*integrated(model, data, qacc), qacc), constraint.residual(model, data, qacc), data
 
 
-def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
+def entry_by_entry(
+    function: Callable[..., Any], model: mjx.Model, *arguments: Any, otherwise: Callable[..., Any] | None = None
+) -> Any:
     """Evaluate `function(model, *arguments)`, unrolled if that pays: a constant model, and few degrees of freedom or
-    native code."""
+    native code. If it does not pay, evaluate `otherwise`."""
     small = model.nv <= MOST_UNROLLED or native_identity() is not None
-    constant = not isinstance(model.body_mass, Tracer)
-    return unrolled(function, model, *arguments) if small and constant else function(model, *arguments)
+    if small and not isinstance(model.body_mass, Tracer):
+        return unrolled(function, model, *arguments, otherwise=otherwise)
+    return (otherwise or function)(model, *arguments)
 
 
 def with_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
-    """Evaluate `function(solver, model, *arguments)`, of any size if native code pays for it, else `entry_by_entry`."""
-    plain, solved = (partial(function, solver) for solver in (constraint.run_solver, constraint.newton))
-    if model.nv <= MOST_UNROLLED:
-        return entry_by_entry(plain, model, *arguments)
-    if constraint.OWN_SOLVER and native_identity() is not None and not isinstance(model.body_mass, Tracer):
-        return unrolled(solved, model, *arguments, otherwise=plain)
-    return plain(model, *arguments)
+    """Evaluate `function(solver, model, *arguments)` entry by entry, solved to rounding, else as `run_solver` does."""
+    plain = partial(function, constraint.run_solver)
+    solved = partial(function, constraint.newton) if constraint.OWN_SOLVER else plain
+    return entry_by_entry(solved, model, *arguments, otherwise=plain)
 
 
 ControlLaw = Callable[[Any, State], Control]
@@ -357,8 +361,8 @@ def _values(
 
 Point = tuple[Qpos, Qvel, Act, Control]
 """Positions, velocities, activations and controls before a step, or their changes."""
-
-
+Forced = Callable[..., mjx.Data]
+"""A step up to the constraint solve: maps (model, *point) to the data of `force_stage`."""
 StepChange = tuple[Array, ...]
 """Changes of positions (nq,), velocities (nv,) and activations (na,) after a step, and of its acceleration (nv,)."""
 
@@ -382,7 +386,8 @@ def change_over(
     if not jax.tree.leaves(changes[0]):
         moved = instantiated(tuple(point), changes[1:])
         return step_change(scene, whole(traced), tuple(point), qacc, moved)
-    return by_tape(lambda qacc, of_model, *at: _at_solution(scene, whole(of_model), qacc, *at), qacc, inputs, changes)
+    forced = partial(_forced, scene)
+    return by_tape(lambda qacc, of_model, *at: at_solution(forced, whole(of_model), qacc, *at), qacc, inputs, changes)
 
 
 def step_change(scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change: Point) -> StepChange:
@@ -395,8 +400,9 @@ def step_change(scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change
         qacc: the converged constrained acceleration there.
         change: change of the point.
     """
-    step = partial(_at_solution, scene, model)
-    if scene.uses_graph and (found := by_graph(partial(_equations, scene), step, model, point, qacc, change)):
+    forced = partial(_forced, scene)
+    step = partial(at_solution, forced, model)
+    if scene.uses_graph and (found := by_graph(partial(equations, forced), step, model, point, qacc, change)):
         return found
     return (_by_columns if scene.forms_matrix else by_tape)(step, qacc, point, change)
 
@@ -457,19 +463,16 @@ def by_graph(
     return tuple(jnp.split(product(entries, jnp.concatenate(changes)), ends))
 
 
-def _equations(
-    scene: Scene, model: mjx.Model, qpos: Array, qvel: Array, act: Array, control: Array, qacc: Array
-) -> tuple[Qvel, Qpos, Qvel, Act]:
-    """Left side of the solver's equation G, and the step S, at any acceleration."""
-    data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
+def equations(forced: Forced, model: mjx.Model, *inputs: Array) -> tuple[Qvel, Qpos, Qvel, Act]:
+    """Left side of the solver's equation G, and the step S, at any acceleration, the last of the inputs."""
+    *point, qacc = inputs
+    data = forced(model, *point)
     return constraint.imbalance(model, data, qacc), *integrated(model, data, qacc)
 
 
-def _at_solution(
-    scene: Scene, model: mjx.Model, known: Array, qpos: Array, qvel: Array, act: Array, control: Array
-) -> tuple[Qpos, Qvel, Act, Qvel]:
+def at_solution(forced: Forced, model: mjx.Model, known: Qvel, *point: Array) -> tuple[Qpos, Qvel, Act, Qvel]:
     """Step and acceleration, whose value is known, with the derivatives of the step."""
-    data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
+    data = forced(model, *point)
     qacc = constraint.solve(model, data.replace(qacc_warmstart=known), lambda _, data: data.qacc_warmstart)
     return *integrated(model, data, qacc), qacc
 
@@ -535,7 +538,7 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Control)
     timestep = model.opt.timestep
 
     def slopes(qpos, qvel, act):
-        data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
+        data = _forced(scene, model, qpos, qvel, act, control)
         return qvel, data.qacc_smooth, data.act_dot
 
     def moved(fraction, slope):

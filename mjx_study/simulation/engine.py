@@ -54,6 +54,15 @@ def host_state(data: mujoco.MjData) -> HostState:
     return HostState(*(np.array(field) for field in fields))
 
 
+def approach_speed(data: mujoco.MjData, contact: Any) -> float:
+    """Speed at which a contact in the engine's data closes along its normal [m/s]; 0 without constraint rows."""
+    if contact.efc_address < 0:
+        return 0.0
+    pyramid = contact.dim > 1 and data.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    rows = 2 * (contact.dim - 1) if pyramid else 1
+    return -float(np.mean(data.efc_vel[contact.efc_address : contact.efc_address + rows]))
+
+
 @contextlib.contextmanager
 def quiet_engine() -> Generator[None]:
     """Keep the engine's warnings in `MjData.warning`, off standard error and out of MUJOCO_LOG.TXT."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.constraint import ELLIPTIC, Qvel, Rows, Scalar, row_force
+from mjx_study.simulation.constraint import ELLIPTIC, Qvel, Rows, Scalar, row_forces_at
 from mjx_study.simulation.corners import CONVEX, PLANE, Corners, corner_pairs, corners
 from mjx_study.simulation.patches import AT_FIRST_TOUCH, DAMPER, SPRING, Place, patched
 from mjx_study.simulation.scene import num_constraint_rows
@@ -140,8 +140,7 @@ def motion(
 
 def course(model: mjx.Model, data: mjx.Data, qvel: Qvel, after: Qvel, qacc: Qvel) -> Course:
     """Course of the guards in a step from velocity `qvel` to velocity `after`, with acceleration `qacc`."""
-    rows: Any = data._impl
-    force = jnp.abs(row_force(model, data, rows.efc_J @ qacc - rows.efc_aref))
+    force = jnp.abs(row_forces_at(model, data, qacc))
     found, leaving = find_guards(model, data, qvel, ends=False), motion(model, data, after, ends=True)
     return Course(found.distance, found.speed, *leaving, found.members @ force > 0, contact_points(model, data))
 

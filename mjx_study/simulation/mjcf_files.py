@@ -1,17 +1,19 @@
 """Check an MJCF and all files that it refers to before MuJoCo opens them, which may wait for ever, crash or exhaust
-memory."""
+memory.
+
+Elements are read as leniently as by MuJoCo's parser, which accepts `a & b` and ignores encodings.
+"""
 
 import dataclasses
+import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Final
 
 from mjx_study.disk import read_bytes
-from mjx_study.simulation.mjcf_limits import ELEMENTS, copies, not_finite, sizes
-from mjx_study.simulation.mjcf_text import Element, elements
 
 _FOLDERS: Final = ("meshdir", "texturedir", "assetdir")
 _FILE: Final = re.compile("file.*")
@@ -24,6 +26,55 @@ DEEPEST: Final = 50
 MOST_ASSET_BYTES: Final = 1_000_000_000
 """Maximum size of a mesh, texture, ... [bytes]."""
 _UNCOUNTED: Final = "mujoco mujocoinclude include compiler option size default frame replicate".split()
+MOST: Final[dict[tuple[str, ...], float]] = {
+    ("hfield", "nrow", "ncol"): 1e8,
+    ("texture", "width", "height"): 1e8,
+    ("mesh", "params"): 1e3,
+    ("numeric", "size"): 1e6,
+    ("camera", "resolution"): 1e8,
+    ("contact", "num"): 1e4,
+    ("size", "memory"): 1e10,
+    ("size", "nuserdata"): 1e6,
+    ("size", "nkey"): 1e4,
+    ("size", "njmax"): 1e6,
+    ("size", "nconmax"): 1e6,
+    ("size", "nstack"): 1e9,
+}
+"""Limit on the product of an element's attributes."""
+ELEMENTS: Final = 2e4
+"""Limit on the number of bodies, joints, geoms, ... after all of `replicate`, `composite`, `flexcomp` and `attach`."""
+SAMPLES: Final = 1e5
+"""Limit on `nsample` of any element."""
+USER: Final = 1e4
+"""Limit on nuser_body, nuser_jnt, ... of <size>."""
+_GRID: Final = "10 10 10"  # of a flexcomp without count
+_UNITS: Final = {"K": 2.0**10, "M": 2.0**20, "G": 2.0**30, "T": 2.0**40, "P": 2.0**50, "E": 2.0**60}
+_TEXTS: Final = re.compile("name|.*class|model|file.*|.*dir|prefix|instance|plugin|content_type")
+"""Attributes whose value is text, whatever it looks like."""
+_OF_TEXT: Final = ("text", "config")
+"""Elements whose attributes are text."""
+_NUMBER: Final = re.compile(
+    r"([+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?))(?:(?<=nan)\(\w*\))?", re.IGNORECASE
+)
+_NAME: Final = r"[:A-Za-z_\x80-\uffff][\w:.\-\x80-\uffff]*+"
+_TOKEN: Final = re.compile(
+    rf"""<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>
+    |</\s*(?P<closed>{_NAME})
+    |<(?P<tag>{_NAME})(?P<attributes>(?:\s*+{_NAME}\s*+=\s*+(?:"[^"]*+"|'[^']*+'))*+)\s*+(?P<empty>/?)""",
+    re.DOTALL | re.VERBOSE,
+)
+_ATTRIBUTE: Final = re.compile(rf"""({_NAME})\s*+=\s*+(?:"([^"]*+)"|'([^']*+)')""")
+_ENTITY: Final = re.compile(r"&(?:#(\d{1,7}+)|#x([0-9a-fA-F]{1,6}+)|(quot|amp|apos|lt|gt));")
+_ENTITIES: Final = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Element:
+    """Start of an element, or its end, which has no attributes."""
+
+    tag: str
+    attributes: dict[str, str]
+    ends: bool = False
 
 
 class RefusedFileError(ValueError):
@@ -151,3 +202,68 @@ def _check_attributes(path: Path, found: _Contents) -> None:
                 raise RefusedFileError(f"{path} asks for {what} of {size:.3g}; the limit is {limit:g}")
         if wrong := not_finite(element, names):
             raise RefusedFileError(f"{path}: {wrong[0]} of <{element.tag}> must be finite, got {wrong[1]!r:.60}")
+
+
+def sizes(element: Element) -> Iterator[tuple[str, float, float]]:
+    """Yield description, size and limit of everything that an element's attributes request."""
+    for (of, *names), limit in MOST.items():
+        if of == element.tag and all(name in element.attributes for name in names):
+            size = math.prod(_product(element.attributes[name]) for name in names)
+            yield f"<{of}> with {' x '.join(names)}", size, limit
+    for name, text in element.attributes.items():
+        if name == "nsample" or (element.tag == "size" and name.startswith("nuser_")):
+            yield f"<{element.tag}> with {name}", _product(text), SAMPLES if name == "nsample" else USER
+
+
+def copies(element: Element) -> float:
+    """Number of bodies that an element makes by itself, or of copies of what is inside a `replicate`."""
+    return _product(element.attributes.get("count", _GRID if element.tag == "flexcomp" else "")) or 1.0
+
+
+def not_finite(element: Element, names: Collection[str]) -> tuple[str, str] | None:
+    """First attribute that holds a number which is not finite, with its value; a value among `names` is a reference."""
+    if element.tag in _OF_TEXT:
+        return None
+    for name, text in element.attributes.items():
+        if "n" not in text and "N" not in text and "e" not in text and "E" not in text:
+            continue  # as nearly all: neither nan, inf nor an exponent
+        if _TEXTS.fullmatch(name) or text in names:
+            continue
+        numbers = list(map(_NUMBER.fullmatch, text.split()))
+        if all(numbers) and not all(math.isfinite(float(number[1])) for number in numbers if number):
+            return name, text
+    return None
+
+
+def _product(text: str) -> float:
+    """Product of the numbers in an attribute such as 10, 3 3 3 or 2G; 0 if there are none."""
+    try:
+        numbers = [float(part.rstrip("KMGTPE")) * _UNITS.get(part[-1], 1.0) for part in text.split()]
+    except ValueError:
+        return 0.0
+    return math.prod(abs(number) for number in numbers) if numbers else 0.0
+
+
+def elements(content: bytes) -> Iterator[Element]:
+    """Yield the start and the end of every element; no text is expanded, and text that is no XML is skipped."""
+    text = os.fsdecode(content.partition(b"\0")[0])
+    for found in _TOKEN.finditer(text):
+        if found["closed"]:
+            yield Element(found["closed"], {}, ends=True)
+        elif found["tag"]:
+            pairs = _ATTRIBUTE.findall(found["attributes"])
+            yield Element(found["tag"], {name: _expanded(double or single) for name, double, single in pairs})
+            if found["empty"]:
+                yield Element(found["tag"], {}, ends=True)
+
+
+def _expanded(text: str) -> str:
+    return _ENTITY.sub(_character, text) if "&" in text else text
+
+
+def _character(found: re.Match[str]) -> str:
+    decimal, hexadecimal, name = found.groups()
+    if name:
+        return _ENTITIES[name]
+    code = int(decimal) if decimal else int(hexadecimal, 16)
+    return chr(code) if 0 < code < 0x110000 else found[0]

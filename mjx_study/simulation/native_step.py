@@ -10,16 +10,25 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from mjx_study.graph.derivative_rule import instantiated, with_rule
+from mjx_study.graph.function import ScalarFunction
 from mjx_study.graph.native import native_identity
 from mjx_study.graph.operation import computed
 from mjx_study.graph.scalars import captured_once
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.dynamics import by_graph, by_tape, force_stage, fwd_position, integrated
+from mjx_study.simulation.dynamics import (
+    at_solution,
+    by_graph,
+    by_tape,
+    equations,
+    force_stage,
+    fwd_position,
+    integrated,
+)
 
 AMPLE: Final = 20
 """Minimum number of solver iterations in a model's budget for its steps to be solved natively, which is to rounding."""
-_MOVING: Final = frozenset({".qpos", ".qvel", ".act", ".ctrl"})
+MOVING: Final = frozenset({".qpos", ".qvel", ".act", ".ctrl"})
 """Inputs for which derivatives are always built; others only where they change."""
 
 Step = tuple[Array, Array, Array, Array]
@@ -39,19 +48,18 @@ def solved_natively(model: mjx.Model, data: mjx.Data) -> Step | None:
         return None
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(model)):
         return None
-    leaves, structure = jax.tree.flatten(data)
-    kinds = tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jax.typeof(leaf).dtype) for leaf in leaves)
-    solved = captured_once(_solved, model, structure.unflatten(kinds))
-    if solved is None:
+    if (found := solved_graph(model, data)) is None:
         return None
-    used = tuple(solved.used)
-    layout = structure, kinds, used
-    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(data)]
-    always = [names[place] in _MOVING for place in used]
+    solved, layout = found
+    _, kinds, used = layout
+    forced = partial(_forced, layout)
+    leaves = jax.tree_util.tree_leaves_with_path(data)
+    names = [jax.tree_util.keystr(path) for path, _ in leaves]
+    always = [names[place] in MOVING for place in used]
     fixed = [names[place] == ".qacc_warmstart" or kinds[place].dtype.kind != "f" for place in used]
 
     def forward(*inputs: Array) -> list[Array]:
-        return computed(solved.of(used), inputs)
+        return computed(solved, jax.tree.leaves(_whole(layout, inputs)))
 
     def rule(primals: Any, changes: Any) -> Any:
         following = advance(*primals)
@@ -59,13 +67,21 @@ def solved_natively(model: mjx.Model, data: mjx.Data) -> Step | None:
             None if still or (change is None and not needed) else instantiated(primal, change)
             for still, needed, primal, change in zip(fixed, always, primals, changes, strict=True)
         )
-        step, qacc = partial(_at_solution, layout, model), following[3]
-        found = by_graph(partial(_equations, layout), step, model, primals, qacc, moved)
+        step, qacc = partial(at_solution, forced, model), following[3]
+        found = by_graph(partial(equations, forced), step, model, primals, qacc, moved)
         return following, list(found or by_tape(step, qacc, primals, moved))
 
     advance = with_rule(forward, rule)
-    qpos, qvel, act, qacc = advance(*(jnp.asarray(leaves[place]) for place in used))
+    qpos, qvel, act, qacc = advance(*(jnp.asarray(leaves[place][1]) for place in used))
     return qpos, qvel, act, qacc
+
+
+def solved_graph(model: mjx.Model, data: mjx.Data) -> tuple[ScalarFunction, Layout] | None:
+    """A step as a graph, of all arrays of `data`; None if it is too large."""
+    leaves, structure = jax.tree.flatten(data)
+    kinds = tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jax.typeof(leaf).dtype) for leaf in leaves)
+    solved = captured_once(_solved, model, structure.unflatten(kinds))
+    return None if solved is None else (solved, (structure, kinds, tuple(solved.used)))
 
 
 def _whole(layout: Layout, inputs: tuple[Array, ...]) -> mjx.Data:
@@ -77,23 +93,15 @@ def _whole(layout: Layout, inputs: tuple[Array, ...]) -> mjx.Data:
     )
 
 
-def _forced(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def _forced(layout: Layout, model: mjx.Model, *inputs: Array) -> mjx.Data:
+    return _forced_from(model, _whole(layout, inputs))
+
+
+def _forced_from(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return force_stage(model, fwd_position(model, data), data.qvel, data.act, data.ctrl)
 
 
 def _solved(model: mjx.Model, data: mjx.Data) -> Step:
-    forced = _forced(model, data)
+    forced = _forced_from(model, data)
     qacc = constraint.newton(model, forced)
-    return *integrated(model, forced, qacc), qacc
-
-
-def _equations(layout: Layout, model: mjx.Model, *inputs: Array) -> tuple[Array, ...]:
-    """Left side of the solver's equation, and the step, at the acceleration that comes last."""
-    forced = _forced(model, _whole(layout, inputs[:-1]))
-    return constraint.imbalance(model, forced, inputs[-1]), *integrated(model, forced, inputs[-1])
-
-
-def _at_solution(layout: Layout, model: mjx.Model, known: Array, *inputs: Array) -> Step:
-    forced = _forced(model, _whole(layout, inputs)).replace(qacc_warmstart=known)
-    qacc = constraint.solve(model, forced, lambda _, data: data.qacc_warmstart)
     return *integrated(model, forced, qacc), qacc

@@ -111,7 +111,7 @@ class ObservedState(State):
     def contact_force(self, first: str | int, second: str | int) -> Float[Array, " 3"]:
         """Force [N] of the second geom on the first, given by names or indices, in the world frame."""
         one, other = (self.scene.geom(geom) if isinstance(geom, str) else int(geom) for geom in (first, second))
-        return self._forced("contact_force", partial(_contact_force, self.scene, (one, other)))
+        return self._forced("contact_force", partial(_contact_force, (one, other)))
 
     def _motion(self, name: str) -> Float[Array, "..."]:
         inputs = (self.qpos,) if name in POSITIONS else (self.qpos, self.qvel)
@@ -130,10 +130,10 @@ class ObservedState(State):
         if host.sensor_delay.any() or host.sensor_interval.any():
             raise ValueError(f"sensordata of {self.scene.name} has no delay or interval; remove them from the MJCF")
         late = bool((host.sensor_needstage == _LATE).any())
-        return self._forced("sensordata", partial(_sensordata, self.scene), needed=late)
+        return self._forced("sensordata", _sensordata, needed=late)
 
     def _forced(self, what: str, function: Any, needed: bool = True) -> Float[Array, "..."]:
-        """A function of (model, qpos, qvel, act, control, acceleration), the last zero unless needed."""
+        """A function of the model and of the data of `mj_forward`, whose acceleration is zero unless needed."""
         host, control = self.scene.host, self.control
         if self.qpos.ndim > 1:
             raise ValueError(f"{what} is computed for single states: map over them with jax.vmap")
@@ -150,7 +150,8 @@ class ObservedState(State):
         model = apply_contact(self.scene.model, self.contact)
         state = State(self.qpos, self.qvel, self.act, self.warmstart)
         qacc = acceleration(self.scene, model, state, control) if needed else jnp.zeros_like(self.qvel)
-        return entry_by_entry(function, model, self.qpos, self.qvel, self.act, control, qacc)
+        point = self.qpos, self.qvel, self.act, control, qacc
+        return entry_by_entry(partial(_forward, self.scene, function), model, *point)
 
 
 def observed(
@@ -190,27 +191,14 @@ def _velocity(host: mujoco.MjModel, data: mjx.Data, name: str) -> Float[Array, "
     return linear + jnp.cross(angular, offset)
 
 
-def _sensordata(
-    scene: Scene, model: mjx.Model, qpos: Qpos, qvel: Array, act: Act, control: Control, qacc: Array
-) -> Float[Array, " nsensordata"]:
-    data = _forward(scene, model, qpos, qvel, act, control, qacc)
+def _sensordata(model: mjx.Model, data: mjx.Data) -> Float[Array, " nsensordata"]:
     with patched():
         for stage in (mjx.sensor_pos, mjx.sensor_vel, mjx.sensor_acc):
             data = stage(model, data)
     return data.sensordata
 
 
-def _contact_force(
-    scene: Scene,
-    pair: tuple[int, int],
-    model: mjx.Model,
-    qpos: Qpos,
-    qvel: Array,
-    act: Act,
-    control: Control,
-    qacc: Array,
-) -> Float[Array, " 3"]:
-    data = _forward(scene, model, qpos, qvel, act, control, qacc)
+def _contact_force(pair: tuple[int, int], model: mjx.Model, data: mjx.Data) -> Float[Array, " 3"]:
     geoms, forces = constraint.contact_forces(model, data)
     on_second = jnp.all(geoms == jnp.array(pair[::-1]), axis=1)
     on_first = jnp.all(geoms == jnp.array(pair), axis=1)
@@ -219,8 +207,8 @@ def _contact_force(
 
 
 def _forward(
-    scene: Scene, model: mjx.Model, qpos: Qpos, qvel: Array, act: Act, control: Control, qacc: Array
-) -> mjx.Data:
-    """All of a step but the integration, as `mj_forward` does it."""
+    scene: Scene, read: Any, model: mjx.Model, qpos: Qpos, qvel: Array, act: Act, control: Control, qacc: Array
+) -> Float[Array, "..."]:
+    """`read` of the model and all of a step but the integration, as `mj_forward` does it."""
     state = State(qpos, qvel, act, jnp.zeros_like(qvel))
-    return constraint.with_forces(model, smooth_stages(scene, model, state, control), qacc)
+    return read(model, constraint.with_forces(model, smooth_stages(scene, model, state, control), qacc))

@@ -90,13 +90,6 @@ def rotation_difference(end: Float[Array, " 4"], start: Float[Array, " 4"]) -> F
     return rotation_between(start, end)
 
 
-def turned_quaternion(
-    quaternion: Float[Array, " 4"], velocity: Float[Array, " 3"], timestep: Float[Array, ""] | float
-) -> Float[Array, " 4"]:
-    """Unit quaternion after a timestep [s] at an angular velocity [rad/s]; replaces MJX's `quat_integrate`."""
-    return rotate_quaternion(quaternion, timestep * velocity)
-
-
 def mjx_module(name: str) -> Any:
     """A module of MJX's implementation, or the package `mujoco.mjx` for the empty name."""
     return sys.modules[f"{mjx.make_constraint.__module__.rpartition('.')[0]}.{name}"] if name else mjx
@@ -195,7 +188,7 @@ Place = tuple[str, str]
 _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("collision_driver", "_contact_groups"): contacts_with_friction,
     ("constraint", "_kbi"): stiffness_damping_impedance,
-    ("math", "quat_integrate"): turned_quaternion,
+    ("math", "quat_integrate"): lambda start, velocity, timestep: rotate_quaternion(start, timestep * velocity),
     ("math", "quat_sub"): rotation_difference,
     ("math", "quat_to_axis_angle"): rotation_vector,
     ("passive", "_spring_damper"): springs_and_dampers,

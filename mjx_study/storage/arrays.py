@@ -1,13 +1,23 @@
-"""The arrays of a cell on disk: an .npz without compression and objects, whose members are no larger than the file."""
+"""The file of a cell: its numbers, or a checkpoint of them.
 
+It is an .npz without compression and objects, whose members are no larger than the file. It holds digests of its
+content, of the study and of the cell, and counts only if all three match.
+"""
+
+import dataclasses
+import hashlib
 import io
-import math
+import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
 
+from mjx_study.disk import read_whole, write_whole
+from mjx_study.experiment.study import StudyError, reason_of
+from mjx_study.options.files import read_npy, validated
 from mjx_study.results.kind import StudyResults, find_kind
 from mjx_study.results.variables import ONSETS, with_metrics
 
@@ -17,15 +27,61 @@ MOST_MEMBERS: Final = 1_000_000
 """Maximum number of arrays in a file."""
 MEMBER: Final = b"PK\x01\x02"
 """Signature of an entry in a zip file's directory."""
-HEADERS: Final = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
-"""Readers of .npy headers, by version of the format."""
 NUMBERS: Final = "fiub"
 """Kinds of the types that a variable may have."""
 MOST_COUNT: Final = 10**15
 """Maximum of a variable that counts."""
+VERSIONS: Final = "versions"
+"""Entry that records the versions that computed a cell."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CellFile:
+    """File of a cell's numbers, with digests of the study, and of the cell's index and coordinates."""
+
+    path: Path
+    study: str
+    cell: str
+
+    def write(self, arrays: Mapping[str, np.ndarray], versions: Mapping[str, str]) -> None:
+        kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
+        digest = np.array([digest_of_arrays(kept), self.study, self.cell])
+        write_whole(self.path, lambda file: write_arrays(file, {"digest": digest} | kept))
+
+    def read(
+        self, check: Callable[[dict[str, np.ndarray]], None] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        """Read numbers and versions; StudyError if the file is damaged, or belongs to another study or cell, or the
+        check raises a ValueError."""
+        path = self.path
+        try:
+            arrays = read_arrays(read_whole(path, follow=False, most=MOST_CELL_BYTES))
+            content, study, cell = arrays.pop("digest").tolist()
+        except Exception as error:  # numpy and zipfile may raise anything
+            raise StudyError(f"{path} is damaged ({reason_of(error)}); move it away to compute it again") from error
+        wrong = {
+            "a cell of another study": study != self.study,
+            "another cell of this study": cell != self.cell,
+            "damaged (its digest does not match)": content != digest_of_arrays(arrays),
+        }
+        if is_that := next((what for what, holds in wrong.items() if holds), None):
+            raise StudyError(f"{path} is {is_that}; move it away to compute it again")
+        try:
+            versions = validated(dict[str, str], str(arrays.pop(VERSIONS, "")))
+            if check is not None:
+                check(arrays)
+        except ValueError as error:
+            reason = f"does not fit the study ({reason_of(error)})"
+            raise StudyError(f"{path} {reason}; move it away to compute it again") from error
+        return arrays, versions
+
+
+def digest_of_arrays(arrays: Mapping[str, np.ndarray]) -> str:
+    sha = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        sha.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
+    return sha.hexdigest()
 
 
 def write_arrays(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
@@ -47,21 +103,8 @@ def read_arrays(content: bytes) -> dict[str, np.ndarray]:
                 raise ValueError("its arrays are compressed")
             if name in found:
                 raise ValueError(f"it holds {name} twice")
-            found[name] = _array(members.read(entry))
+            found[name] = read_npy(members.read(entry))
     return found
-
-
-def _array(content: bytes) -> np.ndarray:
-    """Read a .npy file whose header promises as many bytes as follow."""
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    if version not in HEADERS:
-        raise ValueError(f"an array is in version {'.'.join(map(str, version))} of NumPy's format")
-    shape, by_column, dtype = HEADERS[version](stream)
-    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
-        raise ValueError("an array differs in size from its header")
-    flat = np.frombuffer(content, dtype, offset=stream.tell()) if dtype.itemsize else np.zeros(math.prod(shape), dtype)
-    return flat.reshape(shape, order="F" if by_column else "C")
 
 
 def required(kind: StudyResults) -> list[str]:

@@ -24,13 +24,11 @@ import xarray as xr
 
 from estimators.user_inputs import inputs_now
 from mjx_study.disk import MAX_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
-from mjx_study.experiment.checkpoint import Checkpoint, StudyError, reason_of
-from mjx_study.experiment.study import StudyPlan
+from mjx_study.experiment.study import Checkpoint, StudyError, StudyPlan, reason_of
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.options.files import digest_of_json
 from mjx_study.progress import Progress
-from mjx_study.storage.arrays import check_cell
-from mjx_study.storage.cell_files import CellFile
+from mjx_study.storage.arrays import CellFile, check_cell
 from mjx_study.storage.dataset import dataset_of
 from mjx_study.storage.manifest import document_of, read_document, read_format, sealed
 from mjx_study.table import as_plain
@@ -105,8 +103,7 @@ class Store:
         """Turn finished descents into checkpoints of longer ones; safe to repeat after a kill."""
         for index in range(len(self.document["cells"])):
             if self.has(index):
-                arrays, written_by = self.read_with_versions(index)
-                self.file(index, part=True).write(arrays, written_by)
+                self.file(index, part=True).write(*self.read_with_versions(index))
                 self.path(index).unlink()
         self.document |= {"config": document["config"], "resolved": document["resolved"]}
         self._write_document()
@@ -128,20 +125,17 @@ class Store:
         path = folder / "study.json"
         try:
             content = read_whole(path, follow=False, most=MAX_BYTES)
+            check_no_link(folder / "cells")
             version = read_format(content)
             document = read_document(content) if version == FORMAT else {}
         except FileNotFoundError as error:
             raise StudyError(f"{folder} holds no study: there is no study.json") from error
         except OSError as error:
-            raise StudyError(f"cannot read {path}: {reason_of(error)}") from error
+            raise StudyError(f"cannot read {error.filename or path}: {reason_of(error)}") from error
         except ValueError as error:
             raise StudyError(f"{path} is damaged ({error}); move the folder away to start again") from error
         if version != FORMAT:
             raise StudyError(f"{path} is of format {version}; this program reads {FORMAT}")
-        try:
-            check_no_link(folder / "cells")
-        except OSError as error:
-            raise StudyError(f"cannot read {folder / 'cells'}: {reason_of(error)}") from error
         return cls(folder, document)
 
     def path(self, index: int) -> Path:
@@ -163,15 +157,12 @@ class Store:
         self.file(index).write(arrays, self._authors(index))
         self.part_path(index).unlink(missing_ok=True)
 
-    def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        self.file(index, part=True).write(arrays, self._authors(index))
-
     def checkpoint(self, index: int, report: Progress) -> Checkpoint:
         """A cell's checkpoint; failing to write it must not cost the cell."""
 
         def save(arrays: Mapping[str, np.ndarray]) -> None:
             with suppress(OSError):
-                self.write_part(index, arrays)
+                self.file(index, part=True).write(arrays, self._authors(index))
 
         return Checkpoint(self.read_part(index), save, report, str(self.part_path(index)))
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from estimators import Estimator, find_estimator
+from estimators import find_estimator
 from estimators.choices import ORACLES
 from estimators.intervals import Interval
 from estimators.registry import ESTIMATORS, label_of
@@ -168,7 +168,10 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         "environment": environment() | {"steps": computes_steps()},
         "revision": git_revision(),
         "command": command,
-        "described": {name: describe_estimator(each) for name, each in named},
+        # what figures and reports need of an estimator, so that reading a study imports none
+        "described": {
+            name: {"label": label_of(name), "needs": list(find_estimator(each).needs)} for name, each in named
+        },
         "models": [{"contact": family, "stiffness": stiffness} for family, stiffness in axes["model"]],
         "axes": axes | {"task": _task_names(plan, axes["task"]), "model": _model_names(axes["model"])},
         "resolved": _resolved(plan, places, len(axes["task"])),
@@ -177,13 +180,6 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
             for cell, at in zip(plan.cells, places, strict=True)
         ],
     }
-
-
-def describe_estimator(which: str | Estimator) -> dict[str, Any]:
-    """What figures and reports need of an estimator, so that reading a study imports none."""
-    found = find_estimator(which)
-    name = which if isinstance(which, str) else found.qualified_name()
-    return {"label": label_of(name), "needs": list(found.needs)}
 
 
 def _coordinates(plan: StudyPlan, cell: StudyCell) -> dict[str, Any]:

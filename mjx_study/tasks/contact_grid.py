@@ -11,8 +11,7 @@ import numpy as np
 
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, REFERENCE, laws_of, takes_stiffness
 from mjx_study.limits import MOST_MODELS, check_count
-from mjx_study.options.option import OptionError
-from mjx_study.options.rules import reject_untaken
+from mjx_study.options.option import OptionError, reject_untaken
 from mjx_study.simulation.contact import (
     ContactModel,
     ContactWarning,

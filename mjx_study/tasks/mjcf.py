@@ -16,10 +16,8 @@ from mjx_study.simulation.scene import Scene, SceneOption, load_scene
 from mjx_study.tasks.policy import InitialStatePolicy, OpenLoop
 from mjx_study.tasks.task import StudyDefaults, Task
 
-NOISE: Final = 0.1
-"""Noise level: share of the middle actuator's half range, or [m/s, rad/s] for initial velocities."""
-MIN_MOTION: Final = 1e-9
-"""Displacement that counts as motion [m or rad]."""
+NOISE: Final = 0.1  # share of the middle actuator's half range, or [m/s, rad/s] for initial velocities
+MIN_MOTION: Final = 1e-9  # displacement that counts as motion [m or rad]
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 

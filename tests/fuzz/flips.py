@@ -12,7 +12,7 @@ import pytest
 
 from mjx_study import compiled
 from mjx_study.caches import ProgramCache
-from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.study import StudyError
 from mjx_study.storage.folder import Store, load_study
 from tests.fuzz import studies
 from tests.fuzz.answers import Row, WrongError

@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.disk import temporary_name
-from mjx_study.storage.cell_files import digest_of_arrays
+from mjx_study.storage.arrays import digest_of_arrays
 from mjx_study.storage.folder import Store, load_study
 from mjx_study.storage.manifest import sealed
 from tests.faults import put_no_file

@@ -5,11 +5,10 @@ from importlib import import_module
 from types import SimpleNamespace
 from typing import Any, Final
 
-from experiments.engines.adapters.jax_common import batched
-from experiments.engines.scenes import Scene, Simulate, mjcf, mjcf_index, mjcf_state
+from experiments.engines.adapters.jax_common import batched, started
+from experiments.engines.scenes import Scene, Simulate, mjcf, mjcf_state
 
-SPIN = 1e-6
-"""Angular velocity of every body at the start of `generalized` [rad/s], whose derivative at rest is NaN."""
+SPIN = 1e-6  # angular velocity of every body at the start of `generalized` [rad/s], whose derivative at rest is NaN
 
 
 def short_steps(objective: Callable[[Any], Any], projection: Any, **options: Any) -> Any:
@@ -90,7 +89,6 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
             ProjectedGradient=SOLVERS[solver], projection=import_module("jaxopt.projection")
         )
     loader: Any = import_module("brax.io.mjcf")
-    is_velocity, index = mjcf_index(scene)
     qpos, qvel = mjcf_state(scene, scene.center)
     if family == "generalized" and len(qpos) > 1:
         qvel.reshape(-1, 6)[:, 3:] = SPIN
@@ -99,12 +97,7 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
         jnp = jax.numpy
         system = loader.loads(mjcf(scene, timestep))
         system = system.replace(elasticity=jnp.full_like(system.elasticity, scene.restitution))
-        position, velocity = jnp.asarray(qpos), jnp.asarray(qvel)
-        if is_velocity:
-            velocity = velocity.at[index].set(theta)
-        else:
-            position = position.at[index].set(theta)
-        start = pipeline.init(system, position, velocity)
+        start = pipeline.init(system, *started(jax, scene, (qpos, qvel), theta))
 
         def advance(state, _):
             return pipeline.step(system, state, jnp.zeros(system.act_size())), None

@@ -1,4 +1,4 @@
-"""Drake's MultibodyPlant on AutoDiffXd: discrete updates, by its approximations `sap` and `lagged`.
+"""Drake's MultibodyPlant on AutoDiffXd: discrete updates, by its approximation `sap`.
 
 Compliance and dissipation are Drake's own for point contact. A continuous plant refuses AutoDiffXd: its dissipation is
 looked up as a double.
@@ -19,8 +19,7 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
         raise CannotError("no derivative: boxes on a half space have no point contact on AutoDiffXd")
     builder = d.DiagramBuilder()
     plant, _ = d.AddMultibodyPlantSceneGraph(builder, timestep)
-    approximation = d.DiscreteContactApproximation
-    plant.set_discrete_contact_approximation(approximation.kSap if variant == "sap" else approximation.kLagged)
+    plant.set_discrete_contact_approximation(d.DiscreteContactApproximation.kSap)
     plant.mutable_gravity_field().set_gravity_vector([0, 0, -scene.gravity])
     friction = d.CoulombFriction(scene.friction, scene.friction)
     if scene.floor:

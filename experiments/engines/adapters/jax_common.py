@@ -6,10 +6,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.engines.scenes import Rollout, Scene, Simulate
+from experiments.engines.scenes import Rollout, Scene, Simulate, mjcf_index
 
-CHUNK = 100
-"""Parameters per call of the program."""
+CHUNK = 100  # parameters per call of the program
+
+
+def started(jax: Any, scene: Scene, state: tuple[np.ndarray, np.ndarray], theta: Any) -> tuple[Any, Any]:
+    """Return positions and velocities of a state of `scenes.mjcf` with the parameter in its place."""
+    is_velocity, index = mjcf_index(scene)
+    parts = [jax.numpy.asarray(part) for part in state]
+    parts[is_velocity] = parts[is_velocity].at[index].set(theta)
+    return parts[0], parts[1]
 
 
 def batched(scene: Scene, final_positions: Callable[[Any, Any], Any], *, forward: bool = False) -> Simulate:

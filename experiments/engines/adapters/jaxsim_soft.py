@@ -11,8 +11,7 @@ from typing import Any
 from experiments.engines.adapters.jax_common import batched
 from experiments.engines.scenes import RADIUS, CannotError, Scene, Simulate, damping_ratio
 
-DEPTH = 0.1 * RADIUS
-"""[m]."""
+DEPTH = 0.1 * RADIUS  # [m]
 SHAPES = {
     "sphere": (0.4 * RADIUS**2, 1, f"<sphere><radius>{RADIUS}</radius></sphere>"),
     "box": (2 / 3 * RADIUS**2, 4, f"<box><size>{2 * RADIUS} {2 * RADIUS} {2 * RADIUS}</size></box>"),

@@ -8,8 +8,8 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
-from experiments.engines.adapters.jax_common import batched
-from experiments.engines.scenes import Scene, Simulate, mjcf, mjcf_index, mjcf_state
+from experiments.engines.adapters.jax_common import batched, started
+from experiments.engines.scenes import Scene, Simulate, mjcf, mjcf_state
 
 KAPPA = {"hunt_crossley": 1e-5, "kelvin_voigt": 1e-5, "log_barrier": 1e-3, "conic": 1e-5}
 """Smoothing of mujodico's laws, without which their derivatives are NaN."""
@@ -29,18 +29,12 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
     options = {"contact_approximation": variant, "contact_smoothing": KAPPA[variant]} if variant in KAPPA else {}
     model = mjx.put_model(host, **options)
     data = mjx.make_data(model)
-    qpos, qvel = mjcf_state(scene, scene.center)
-    is_velocity, index = mjcf_index(scene)
+    state = mjcf_state(scene, scene.center)
 
     def final_positions(jax, theta):
-        jnp = jax.numpy
-        position, velocity = jnp.asarray(qpos), jnp.asarray(qvel)
-        if is_velocity:
-            velocity = velocity.at[index].set(theta)
-        else:
-            position = position.at[index].set(theta)
+        position, velocity = started(jax, scene, state, theta)
         start = data.replace(qpos=position.astype(data.qpos.dtype), qvel=velocity.astype(data.qvel.dtype))
-        last, _ = jax.lax.scan(lambda state, _: (step(model, state), None), start, length=scene.steps(timestep))
+        last, _ = jax.lax.scan(lambda data, _: (step(model, data), None), start, length=scene.steps(timestep))
         return mjx.kinematics(model, last).xipos[1:]
 
     return batched(scene, final_positions, forward=variant in ("forward", *KAPPA))

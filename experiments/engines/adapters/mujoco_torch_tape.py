@@ -13,8 +13,7 @@ import numpy as np
 
 from experiments.engines.scenes import LENGTH, PIVOT, Rollout, Scene, Simulate, mjcf, mjcf_index, mjcf_state
 
-ITERATIONS = 4
-"""Of the solver and of its line search."""
+ITERATIONS = 4  # of the solver and of its line search
 
 
 def build(scene: Scene, timestep: float, variant: str) -> Simulate:

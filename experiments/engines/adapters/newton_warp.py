@@ -1,4 +1,4 @@
-"""Newton on NVIDIA Warp's tape, on a CPU and in float32: variants `semi_implicit`, `xpbd`, and `old`,
+"""Newton on NVIDIA Warp's tape, on a CPU and in float32: variants `semi_implicit` and `old`,
 Newton 1.0.0, whose gravity is a number.
 
 Stiffness and damping are Newton's defaults, shared among the points of a contact. The gain of friction is `GAIN`: its
@@ -14,14 +14,12 @@ import numpy as np
 
 from experiments.engines.scenes import LENGTH, LIMIT, PIVOT, RADIUS, Rollout, Scene, Simulate
 
-WORLDS = 100
-"""Rollouts that are simulated at once."""
+WORLDS = 100  # rollouts that are simulated at once
 GAIN = 50.0
 """Friction per slip speed [N s/m]: a sphere's contact has an effective mass of 2/7 kg, and steps of 5 ms bear 114."""
 STIFFNESS, DAMPING = 2500.0, 100.0
 """Newton's defaults [N/m, N s/m]."""
-BOB = 0.05
-"""Radius of the pendulum's ball [m], as in MuJoCo's model."""
+BOB = 0.05  # radius of the pendulum's ball [m], as in MuJoCo's model
 
 
 def add_pendulum(wp: Any, newton: Any, world: Any) -> None:
@@ -84,10 +82,7 @@ def build(scene: Scene, timestep: float, variant: str) -> Simulate:
         builder.add_shape_plane(plane=(-1.0, 0.0, 0.0, scene.wall), width=0.0, length=0.0, cfg=config)
     with wp.ScopedDevice("cpu"):
         model = builder.finalize(requires_grad=True)
-        if variant == "xpbd":
-            solver = newton.solvers.SolverXPBD(model, enable_restitution=scene.restitution > 0)
-        else:
-            solver = newton.solvers.SolverSemiImplicit(model)
+        solver = newton.solvers.SolverSemiImplicit(model)
         states = [model.state() for _ in range(scene.steps(timestep) + 1)]
         pipeline = newton.CollisionPipeline(model, requires_grad=True)
         contacts = [pipeline.contacts() for _ in states[1:]]

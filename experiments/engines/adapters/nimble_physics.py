@@ -5,20 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from experiments.engines.scenes import LENGTH, LIMIT, PIVOT, RADIUS, CannotError, Rollout, Scene, Simulate
+from experiments.engines.scenes import LENGTH, LIMIT, PIVOT, RADIUS, Rollout, Scene, Simulate
 
-UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""From the scene's axes to the engine's."""
-THICK = 1.0
-"""Half thickness of floor and wall, which are boxes [m]."""
-SPREAD = 0.4 * 0.05**2
-"""Moment of inertia of the pendulum's ball about its center, as in MuJoCo's model [kg m^2]."""
+UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from the scene's axes to the engine's
+THICK = 1.0  # half thickness of floor and wall, which are boxes [m]
+SPREAD = 0.4 * 0.05**2  # moment of inertia of the pendulum's ball about its center, as in MuJoCo's model [kg m^2]
 
 
 def build(scene: Scene, timestep: float, variant: str) -> Simulate:
-    """Return rollouts by the solver of this name, of its one; restitution is the engine's."""
-    if variant != "lcp":
-        raise CannotError("this adapter has the solver lcp alone")
+    """Return rollouts by its one solver; restitution is the engine's."""
     torch: Any = import_module("torch")
     nimble: Any = import_module("nimblephysics")
     torch.set_num_threads(1)
