@@ -1,8 +1,11 @@
 """Names that users choose from, with one-line descriptions; free of imports that compute."""
 
 import dataclasses
+import os
+import re
 from collections.abc import Iterable
 from importlib import metadata
+from pathlib import Path
 from typing import Final
 
 from estimators.choices import unknown
@@ -134,5 +137,9 @@ def unknown_task(name: str, reason: str = "") -> str | None:
     registered = sorted({point.name for point in metadata.entry_points(group=TASK_GROUP)})
     if (name in TASK_DESCRIPTIONS or name in registered or ":" in name or is_file(name)) and not reason:
         return None
+    module = Path(name.removesuffix(".py") + ".py")
+    if not reason and os.path.isfile(module):  # unlike Path's, False for names that no file can have
+        tasks = re.findall(r"^def ([a-z]\w*)\(", module.read_text(errors="replace"), re.MULTILINE) or ["NAME"]
+        return f"{name} is a module: choose a task in it, as {' or '.join(f'{module.stem}:{each}' for each in tasks)}"
     choices = dict.fromkeys([*TASK_DESCRIPTIONS, *registered])
     return unknown("task", name, choices, ", module:name of your own, or an MJCF") + reason

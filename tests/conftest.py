@@ -120,6 +120,14 @@ def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator
         yield
 
 
+@pytest.fixture
+def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cells of gradients take no time, and their numbers are NaN."""
+    from tests.documents import planned_arrays, stub_cells  # not above, for the same reason
+
+    stub_cells(monkeypatch, planned_arrays)
+
+
 @pytest.fixture(scope="module")
 def workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A client of two workers, which tell in a file what they compute of the task `poison`."""

@@ -22,6 +22,8 @@ from mjx_study.storage import arrays as cell_files
 CALLS: Final = ("open", "mkdir", "fsync", "fchmod", "replace")
 """Functions of `os` that change the disk; writes to open files count as well."""
 PTRACE_TRACEME, PTRACE_SYSCALL = 0, 24
+NO_FILES: Final = ("fifo", "socket", "folder", "device")
+"""What may stand where a regular file belongs."""
 
 
 class Faults:
@@ -156,7 +158,7 @@ def deadline(seconds: float, error: type[BaseException] = TimeoutError) -> Gener
 
 
 def put_no_file(path: Path, kind: str) -> None:
-    """Something at a path that is no regular file: fifo, socket, folder or device."""
+    """One of `NO_FILES` at a path."""
     path.unlink(missing_ok=True)
     if kind == "fifo":
         os.mkfifo(path)

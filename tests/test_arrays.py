@@ -34,10 +34,7 @@ def test_arrays_come_back(tmp_path: Path) -> None:
     ("content", "says"),
     [
         (packed({"a.npy": npy((1,), content=bytes(8))}, zipfile.ZIP_DEFLATED), "its arrays are compressed"),
-        (
-            packed({"a.npy": npy((10**5,), content=bytes(8 * 10**5))}, zipfile.ZIP_DEFLATED),
-            "its arrays are larger than",
-        ),
+        (packed({"a.npy": npy((10**5,), content=bytes(8 * 10**5))}, zipfile.ZIP_DEFLATED), "arrays are larger than"),
         (packed({"a.npy": npy((2,), content=bytes(8))}), "an array differs in size from its header"),
         (packed({"a.npy": npy((1,), "|O", bytes(8))}), "an array differs in size from its header"),
         (packed({"a.npy": npy((1,), version=b"\x03\x00", content=bytes(8))}), "an array is in version 3.0 of NumPy's"),

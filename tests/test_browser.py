@@ -15,69 +15,13 @@ from typing import Any, Final
 
 import pytest
 
-from tests.test_links import ROOT
+from tests.processes import ROOT
 
 NAMES: Final = "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 BROWSER: Final = next(filter(None, map(shutil.which, NAMES)), None)
 WIDTHS: Final = 390, 1280
-HARNESS: Final = """<!doctype html><link rel="icon" href="data:,"><body><script>
-const rendered = (part) => part.getClientRects().length > 0;
-function luminance(color) {
-  const parts = color.match(/[\\d.]+/g).map(Number);
-  return [0.2126, 0.7152, 0.0722].reduce((sum, weight, index) => {
-    const part = parts[index] / 255;
-    return sum + weight * (part <= 0.03928 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4);
-  }, 0);
-}
-function behind(part) {
-  for (; part; part = part.parentElement) {
-    const color = getComputedStyle(part).backgroundColor;
-    if (!/, 0\\)$/.test(color) && color !== "transparent") return color;
-  }
-  return "rgb(255, 255, 255)";
-}
-function contrast(part) {
-  const [low, high] = [getComputedStyle(part).color, behind(part)].map(luminance).sort((a, b) => a - b);
-  return (high + 0.05) / (low + 0.05);
-}
-function found(view) {
-  const {document} = view, page = document.documentElement, all = [...document.body.querySelectorAll("*")];
-  const main = document.querySelector("article") || document.body, text = [...main.querySelectorAll("p, td, h1, code")];
-  const hidden = (part) => ["hidden", "clip"].includes(view.getComputedStyle(part).overflowX);
-  const name = (part) => `${part.tagName} ${part.textContent.trim().slice(0, 40)}`;
-  const first = main.querySelector("pre");
-  return {
-    wide: Math.max(0, page.scrollWidth - page.clientWidth),
-    cut: [...main.querySelectorAll("p, pre, td, figure")].filter(
-      (part) => rendered(part) && hidden(part) && part.scrollWidth > part.clientWidth + 1).map(name),
-    broken: [...document.images].filter((image) => !image.naturalWidth).map((image) => image.src),
-    unnamed: [...document.images].filter((image) => !image.alt).map((image) => image.src),
-    faint: text.filter((part) => rendered(part) && part.textContent.trim() && contrast(part) < 4.5).map(name),
-    dark: luminance(behind(main)) < 0.2,
-    first: first ? first.scrollWidth - first.clientWidth : 0,
-    parts: all.length,
-  };
-}
-async function opened(path, width) {
-  const frame = document.createElement("iframe");
-  frame.style = `width: ${width}px; height: 900px`;
-  frame.src = path;
-  const loaded = new Promise((done) => frame.addEventListener("load", done));
-  document.body.append(frame);
-  await loaded;
-  for (const image of frame.contentDocument.images) image.loading = "eager";
-  await new Promise((done) => setTimeout(done, 300));
-  const result = found(frame.contentWindow);
-  frame.remove();
-  return result;
-}
-(async () => {
-  const results = {};
-  for (const path of PATHS) for (const width of WIDTHS) results[`${path} at ${width}`] = await opened(path, width);
-  document.body.innerHTML = `<pre id="results"></pre>`;
-  document.getElementById("results").textContent = JSON.stringify(results);
-})();
-</script>"""
+HARNESS: Final = ROOT / "tests" / "data" / "browser.html"
+"""A page that opens others at some widths, and measures what is wrong with them."""
 
 
 class Silent(http.server.SimpleHTTPRequestHandler):
@@ -112,7 +56,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, list[
         run([sys.executable, "-m", "mjx_study", "report", name])
     (folder / "faulty.html").write_text(FAULTY)
     paths = [str(path.relative_to(folder)) for path in sorted(folder.rglob("*.html"))]
-    script = HARNESS.replace("PATHS", json.dumps(paths)).replace("WIDTHS", json.dumps(WIDTHS))
+    script = HARNESS.read_text().replace("PATHS", json.dumps(paths)).replace("WIDTHS", json.dumps(WIDTHS))
     (folder / "harness.html").write_text(script)
     handler = functools.partial(Silent, directory=str(folder))
     with http.server.ThreadingHTTPServer(("localhost", 0), handler) as server:

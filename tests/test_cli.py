@@ -39,9 +39,8 @@ def small_run(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -
     return folder, out.getvalue()
 
 
-def test_compare_reports_every_column_for_every_cell(small_run: tuple[Path, str]) -> None:
-    folder, printed = small_run
-    rows = rows_of(load_study(folder))
+def test_compare_has_a_row_for_every_cell(small_run: tuple[Path, str]) -> None:
+    rows = rows_of(load_study(small_run[0]))
     cells = [(row.contact, row.stiffness, row.estimator) for row in rows]
     names = ["zobg", "fobg", "aobg", "ivw"]
     swept = [("penalty", stiffness, name) for stiffness in (10.0, 1000.0) for name in names]
@@ -50,9 +49,6 @@ def test_compare_reports_every_column_for_every_cell(small_run: tuple[Path, str]
         assert row.variance_lower <= row.variance <= row.variance_upper
         assert row.seconds_per_sample > 0 and row.residual < 1e-6 and row.nonfinite == 0
         assert (row.alpha is None) == (row.estimator in ("zobg", "fobg"))
-    for heading in ("|gradient|", "variance", "relative error", "cosine", "alpha", "epsilon", "B", "ms"):
-        assert heading in printed
-    assert "residual" in printed and "nan" in printed
 
 
 def test_a_result_holds_what_decided_it(small_run: tuple[Path, str]) -> None:
@@ -119,14 +115,8 @@ def test_every_command_about_a_task_overrides_the_options_of_its_mjcf(
         raise ValueError("seen")
 
     monkeypatch.setitem(TASKS, "pusher", builder)
-    given = {
-        "integrator": "euler",
-        "solver": "cg",
-        "solver_iterations": 7,
-        "solver_ls_iterations": 9,
-        "horizon": 4,
-        "timestep": 0.001,
-    }
+    given = {"integrator": "euler", "solver": "cg", "solver_iterations": 7, "solver_ls_iterations": 9}
+    given |= {"horizon": 4, "timestep": 0.001}
     flags = [text for name, value in given.items() for text in (OPTIONS[name].flag, str(value))]
     flags += ["--disable-flag", "warmstart,gravity", *(["--dry-run"] if command == "sweep" else [])]
     assert "seen" in refused([command, "pusher", *flags], capsys)

@@ -11,7 +11,6 @@ from mjx_study.digest import FORMER, digest_of
 from mjx_study.identity import NOT_COMPUTING, computing_code, contents, differences
 from mjx_study.reference import MomentumTransfer
 from mjx_study.tasks import make_task
-from tests.processes import run_script
 from tests.test_layering import FILES, LAYERS, ROOT, module_of, read
 
 RUN = "mjx_study.execution.run"
@@ -24,16 +23,6 @@ PACKAGED = [
     if path.is_file() and path.suffix != ".pyc"
 ]
 NO_CODE = {"estimators/py.typed", "mjx_study/py.typed", "mjx_study/templates/report.html"}
-LOADED = """
-import sys
-from mjx_study.execution.run import run_study
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.runtime import configure
-options = {"contact": ("reference",), "stiffness": (1000.0,), "estimators": ("zobg", "fobg"), "samples": (4,)}
-configure(cpu_devices=1)
-run_study(StudyConfig(tasks=("ball_wall",), seeds=1, **options))
-print(*(name for name in sys.modules if name.partition(".")[0] in ("mjx_study", "estimators")))
-"""
 
 
 def imported_by(*roots: str) -> set[str]:
@@ -62,11 +51,6 @@ def test_all_that_a_study_imports_counts() -> None:
     static = imported_by(RUN, *KINDS.values())
     assert {"mjx_study.simulation.dynamics", "mjx_study.experiment.gradients"} <= static
     assert not [name for name in static if not counts(PATHS[name])]
-
-
-def test_all_that_a_study_loads_counts() -> None:
-    loaded = set(run_script(LOADED).stdout.split()) & PATHS.keys()
-    assert {"mjx_study", "mjx_study.objective"} <= loaded and not [name for name in loaded if not counts(PATHS[name])]
 
 
 def test_parts_above_execution_do_not_count() -> None:

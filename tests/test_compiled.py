@@ -53,11 +53,11 @@ def test_a_trace_is_found_again_and_gives_the_same_bits(folder: Path, monkeypatc
     first = evaluated(pusher())
     (path,) = folder.glob("*.trace")
     assert path.stat().st_size < 100_000
-    monkeypatch.setattr(programs, "rollout_cost", untraceable)
-    np.testing.assert_array_equal(evaluated(pusher()), first)
+    with monkeypatch.context() as patch:
+        patch.setattr(programs, "rollout_cost", untraceable)
+        np.testing.assert_array_equal(evaluated(pusher()), first)
     monkeypatch.setattr(compiled, "traces_folder", lambda: None)
-    with pytest.raises(AssertionError, match="traced"):
-        evaluated(pusher())
+    np.testing.assert_array_equal(evaluated(pusher()), first)
 
 
 def test_a_rollout_alone_is_found_again_though_its_native_code_is_not_for_batches(folder: Path) -> None:
@@ -71,12 +71,6 @@ def test_a_rollout_alone_is_found_again_though_its_native_code_is_not_for_batche
 
 def cost_of_one_rollout(*given: Any) -> np.ndarray:
     return np.asarray(compiled_rollout(pusher())(*given)[2])
-
-
-def test_without_a_folder_the_bits_are_the_same(monkeypatch: pytest.MonkeyPatch):
-    kept = evaluated(pusher())
-    monkeypatch.setattr(compiled, "traces_folder", lambda: None)
-    np.testing.assert_array_equal(evaluated(pusher()), kept)
 
 
 def test_a_damaged_file_is_made_again(folder: Path):
@@ -271,12 +265,9 @@ def test_gpu_programs_run_whole_loops_in_graphs_unless_xla_flags_say_otherwise(m
     options = compiled.compiler_options.__wrapped__()
     assert options is not None  # this XLA knows the names
     assert "WHILE" in ",".join(options.values())
-    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_enable_command_buffer=")
-    assert compiled.compiler_options.__wrapped__() is None
-
-
-def test_xla_without_the_options_of_graphs_compiles_without_them(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with monkeypatch.context() as patch:
+        patch.setenv("XLA_FLAGS", "--xla_gpu_enable_command_buffer=")
+        assert compiled.compiler_options.__wrapped__() is None
     monkeypatch.setattr(compiled, "GRAPHS", "FUSION,OF_ANOTHER_VERSION")
     assert compiled.compiler_options.__wrapped__() is None
 

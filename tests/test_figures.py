@@ -73,7 +73,7 @@ def legend_of(figure: Figure) -> list[str]:
 
 
 def test_titles_and_labels_fit_their_axes_on_paper() -> None:
-    models = [(family, stiffness) for family in FAMILIES for stiffness in (10.0, 1000.0)]
+    models = [(family, stiffness) for family in FAMILIES[:3] for stiffness in (10.0, 1000.0)]
     several = {"seeds": 3, "squared_bias": 0.5, "squared_bias_se": 0.1}
     studies = [study("gradients", models), study("gradients", models, **several), study("descents", models),
                study("landscapes", models[::2])]  # fmt: skip
@@ -213,9 +213,7 @@ def test_unstable_steps_are_shown_wherever_the_axis_is_stiffness() -> None:
     shaded = [[patch for patch in axes.patches if patch.get_label() == UNSTABLE] for axes in figure.axes]
     assert [len(each) for each in shaded] == [1, 1, 1, 1]  # two rows: from the limit on; the first of two families
     assert shaded[1][0].get_extents().width > 0 and UNSTABLE in legend_of(figure)
-    assert (
-        figure.legends[0].get_lines()[0].get_linestyle() == "-"
-    )  # as in the panel of a family, not as single models are drawn
+    assert figure.legends[0].get_lines()[0].get_linestyle() == "-"  # as in the panel of a family, not of single models
     assert not any(text.get_text() == UNSTABLE for axes in figure.axes for text in axes.texts)  # not on the data
     swept = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1e4)]
     chart = plot_study(study("gradients", swept, 3, (0.1, 1.0)))["map_stiffness_sigma"]
@@ -258,13 +256,8 @@ def test_a_report_shows_what_there_is_and_once() -> None:
         ]
     }
     page = render_report(lines)
-    figures = re.findall(r'<img alt="(.*?)"', page)
-    assert figures and all(re.fullmatch(r"\w+: .{20,}", each) for each in figures)
-    titles = dict(re.findall(r'<th title="(.*?)">(.*?)</th>', page))
-    assert (
-        all(f"<b>{heading}</b>: {meaning}" in page for meaning, heading in titles.items()) and "nan" in titles.values()
-    )
-    assert 'name="viewport"' in page and "prefers-color-scheme: dark" in page
+    meanings = re.findall(r'<th title="(.*?)">(.*?)</th>', page)
+    assert meanings and all(f"<b>{heading}</b>: {meaning}" in page for meaning, heading in meanings)
     assert "<td>gamma</td>" in page and "<td>theta</td>" not in page and "<td>direction</td>" not in page
 
 

@@ -2,15 +2,16 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mjx_study import cli
 from mjx_study.execution.forecast import forecast_study
-from mjx_study.execution.run import run_study
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import StudyConfig
+from mjx_study.storage.folder import load_study
 from tests.documents import content
 
 DESCENTS = (
@@ -47,27 +48,19 @@ def test_points_of_landscapes_are_counted() -> None:
 
 
 def test_what_is_forecast_is_what_descents_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Their own count of rollouts, and after that nothing is left to do."""
+    """Their own count of rollouts; nothing is written, and another study is refused."""
     folder = tmp_path / "out"
-    assert cli.main([*DESCENTS, str(folder), "--dry-run", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert not folder.exists() and (told["cells"], told["computed"], told["programs"]) == (1, 0, 0)
-    config = StudyConfig(
-        tasks=("pusher",), contact=("reference",), stiffness=(550.0,), horizon=8, iterations=3, seeds=2, samples=(4,),
-        evaluation_samples=5, estimators=("zobg", "fobg"),
-    )  # fmt: skip
-    data = run_study(config, tmp_path / "other")
-    assert told["rollouts"] == 2 * 3 * int(np.sum(data["rollouts"])) + (2 * 2 + 1) * 5
-    assert told["gradients"] == 2 * 3 * 4 and told["kept"] >= 8 * data["theta"].size
 
-    assert cli.main([*DESCENTS, str(folder)]) == 0
-    before = content(folder)
-    capsys.readouterr()
-    assert cli.main([*DESCENTS, str(folder), "--dry-run"]) == 0
-    assert "cells: 1, 1 computed, 0 to compute\n" in capsys.readouterr().out
-    longer = ["5" if part == "3" else part for part in DESCENTS]
-    assert cli.main([*longer, str(folder), "--dry-run", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["computed"] == 0
+    def told(*options: str) -> dict[str, Any]:
+        assert cli.main([*DESCENTS, str(folder), "--json", *options]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    found = told("--dry-run")
+    assert not folder.exists() and (found["cells"], found["computed"], found["programs"]) == (1, 0, 0)
+    told()
+    data, before = load_study(folder), content(folder)
+    assert found["rollouts"] == 2 * 3 * int(np.sum(data["rollouts"])) + (2 * 2 + 1) * 5
+    assert found["gradients"] == 2 * 3 * 4 and found["kept"] >= 8 * data["theta"].size
+    assert told("--dry-run")["computed"] == 1 and told("--dry-run", "--iterations", "5")["computed"] == 0
     assert cli.main([*DESCENTS, str(folder), "--dry-run", "--sigma", "0.3"]) == 2
-    assert "holds another study" in capsys.readouterr().err
-    assert content(folder) == before
+    assert "holds another study" in capsys.readouterr().err and content(folder) == before

@@ -30,7 +30,8 @@ from mjx_study.storage.arrays import required
 from mjx_study.storage.folder import Store, load_study
 from tests.documents import content, same, study_document
 from tests.faults import Killed, kill_after
-from tests.test_layering import FILES, ROOT
+from tests.processes import ROOT
+from tests.test_layering import FILES
 
 NUMBERS = Path(__file__).parent / "data" / "kinds.json"
 """Sums of the absolute finite values of every variable, per kind of study."""
@@ -79,6 +80,7 @@ def test_a_folder_holds_what_a_run_returns(studies: dict[str, Path], name: str) 
     """As does memory; and every variable has a unit and a name, and a cell all that its kind requires."""
     loaded = load_study(studies[name])
     assert same(run_study(config(name)), loaded) and loaded.attrs["missing_cells"] == 0
+    assert not same(run_study(config(name, seed=1)), loaded)
     with xr.open_dataset(studies[name] / "results.nc") as stored:
         assert stored.equals(loaded)
     assert set(required(find_kind(config(name).settings.kind))) <= set(loaded)
@@ -205,6 +207,8 @@ def test_a_study_is_drawn_reported_and_tabulated(studies: dict[str, Path], copy:
     assert found.mjx_study.findings() == findings_of(found) and len(found.mjx_study.table()) >= 2
     page = render_report(found)
     assert page.count("data:image/png;base64,") == len(FIGURES[name])
+    assert all(f'alt="{figure}: ' in page for figure in figures) and "jaxlib" in page
+    assert "http" not in page.replace("http-equiv", "") and "<script" not in page  # it needs nothing else
     assert page.count("<td>FoBG</td>") == 2 * ("fobg" in found["estimator"].values)
     first, *others = sorted((copy / "cells").iterdir())
     first.unlink()

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from estimators import AlphaOrder
-from estimators.intervals import Interval
 from mjx_study import cli, tasks
 from mjx_study.cli.sweep import sweep_fields
 from mjx_study.experiment.plan import plan_study
@@ -200,6 +199,9 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("gradcheck tennis --mean --estimators delta", "'delta' needs noise that is added to theta itself"),
         ("gradcheck tennis --mean --onset jump --estimators total_propagation", "--onset has no effect"),
         ("gradcheck model.xml --mean", "no MJCF file at model.xml"),
+        ("rollout pusher --renderer povray", "unknown renderer 'povray'; choose from auto"),
+        ("rollout pusher --format avi", "unknown format 'avi'; choose from gif, mp4"),
+        ("rollout pusher --theta 1,2", "--theta has 2 numbers; pusher needs 200, all of them finite"),
         ("rollout pusher --view zx", "argument --view: unknown view 'zx'; choose from auto, xz"),
         ("rollout pusher --seed 3", "--seed has an effect only with --noisy, as the initial state is fixed"),
         ("rollout pusher --sigma 0.2", "--sigma has an effect only with --noisy"),
@@ -245,18 +247,9 @@ def test_a_file_and_flags_are_one_configuration() -> None:
     )
     parsed = cli.parser().parse_args(["sweep", "--config", "study.toml", "--seeds", "3", "--points", "5"])
     assert StudyConfig(**sweep_fields(parsed)) == StudyConfig(
-        tasks=("pusher",),
-        sigma=(10.0, 100.0, 1000.0),
-        samples=(4, 8),
-        seeds=3,
-        horizon=9,
-        direction="3",
-        solref=((-100.0, -5.0),),
-        solimp=((0.9, 0.95, 0.001, 0.5, 2.0),),
-        contact=(),
-        published=True,
-        points=5,
-    )
+        tasks=("pusher",), sigma=(10.0, 100.0, 1000.0), samples=(4, 8), seeds=3, horizon=9, direction="3", points=5,
+        solref=((-100.0, -5.0),), solimp=((0.9, 0.95, 0.001, 0.5, 2.0),), contact=(), published=True,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -279,18 +272,6 @@ def test_a_file_and_flags_are_one_configuration() -> None:
 def test_text_is_read(name: str, text: str, value: Any) -> None:
     assert OPTIONS[name].parse(text) == value
     assert OPTIONS[name].read(text if OPTIONS[name].many else value) == value
-
-
-def test_intervals_in_words() -> None:
-    said = {
-        text: str(Interval(text)) for text in ("(0, inf)", "(0, inf]", "[0, 1)", "[1, 1e6]", "(-inf, inf)", "(2, 3)")
-    }
-    assert list(said.values()) == [
-        "positive and finite", "positive", "at least 0 and less than 1", "at least 1 and at most 1000000", "finite",
-        "greater than 2 and less than 3",
-    ]  # fmt: skip
-    assert float("inf") in Interval("(0, inf]") and float("inf") not in Interval("(0, inf)")
-    assert not any(float("nan") in Interval(text) for text in said)
 
 
 def test_every_field_is_declared_and_documented() -> None:

@@ -6,7 +6,6 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -16,7 +15,6 @@ from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_esti
 from mjx_study import cli
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.plots.style import combines, style_of
-from mjx_study.results.rows import rows_of
 from mjx_study.storage.folder import load_study
 from tests.documents import altered
 
@@ -41,21 +39,11 @@ STUDIES = {
     "descents": ["--iterations", "2", "--samples", "4", "--seeds", "2", "--learning-rate", "0.01"],
     "landscapes": ["--points", "3", "--direction", "0", "--span=-1,1", "--samples", "4"],
 }
-"""Of each kind, the smallest that has all its figures."""
+"""Of each kind, the smallest that has all its figures; test_kinds names them."""
 BOTH = {"SignAgreement", "Cautious"}
-FIGURES = {
-    "batch": {"comparison": BOTH},
-    "gradients": {
-        "variance": BOTH,
-        "bias": BOTH,
-        "error_against_samples": BOTH,
-        "alpha": {"Cautious"},
-        "map_stiffness_samples": set(),
-    },
-    "descents": {"achieved": BOTH, "descent": BOTH},
-    "landscapes": {"landscape": BOTH},
-}
-"""What each figure shows of them; a map is of zobg and fobg."""
+IN_FIGURES = {"alpha": {"Cautious"}, "map_stiffness_samples": set[str]()}
+"""What figures show of them, if not both: a map is of zobg and fobg."""
+CHOSEN = ["--estimators", f"zobg,fobg,{OWN},{CAUTIOUS},registered", "--chunk-size", "4"]
 NUMBER = {"batch": "variance", "gradients": "variance", "descents": "final_cost", "landscapes": "slope"}
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
@@ -70,36 +58,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     yield tmp_path
     assert sys.path == path
     sys.modules.pop("my_estimators", None)
-
-
-def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    assert cli.main([*arguments, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def test_compare_takes_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small = ["pusher", "--horizon", "4", "--samples", "8", "--reference-samples", "8", "--stiffness", "10,100"]
-    small += ["--chunk-size", "4"]
-    common = [*small, "--contact", "penalty", "--estimators", f"fobg,{OWN}"]
-    assert cli.main(["compare", *common, "--baseline", "none", "--output", "out"]) == 0
-    assert re.search(r"^ +SignAgreement  ", capsys.readouterr().out, re.MULTILINE)
-    first, mine, *_ = rows_of(load_study(folder / "out"))
-    assert mine.estimator == OWN and first.variance != mine.variance > 0
-    assert (folder / "out" / "comparison.pdf").exists()
-
-
-def test_optimise_takes_it_and_goes_on(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["optimise", "pusher", "--reference", "--horizon", "4", "--samples", "8", "--seeds", "1"]
-    arguments += ["--estimators", OWN, "--learning-rate", "0.01", "--output", "out", "--json", "--iterations"]
-    assert cli.main([*arguments, "2"]) == 0 and cli.main([*arguments, "3"]) == 0
-    capsys.readouterr()
-    assert {path.name for path in (folder / "out").iterdir()} >= {
-        "policy-my_estimators.SignAgreement.json", "descent.png", "results.nc",
-    }  # fmt: skip
-    sys.modules.pop("my_estimators")
-    (folder / "my_estimators.py").write_text(CODE.replace("sign(low.mean) ==", "sign(low.mean) !="))
-    assert cli.main([*arguments, "4"]) == 2
-    assert "holds another study (" in capsys.readouterr().err
 
 
 class Registered(FirstOrder):
@@ -117,8 +75,7 @@ def studies(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> 
         patch.chdir(root)
         patch.setitem(ESTIMATORS, "registered", Registered)
         for name, arguments in STUDIES.items():
-            chosen = ["--estimators", f"zobg,fobg,{OWN},{CAUTIOUS},registered", "--chunk-size", "4"]
-            assert cli.main(["sweep", *ANALYTIC, *arguments, *chosen, "--output", name]) == 0
+            assert cli.main(["sweep", *ANALYTIC, *arguments, *CHOSEN, "--output", name]) == 0
     sys.modules.pop("my_estimators", None)
     return {name: root / name for name in STUDIES}
 
@@ -129,12 +86,27 @@ def test_every_figure_and_report_shows_it(name: str, studies: dict[str, Path], f
     shutil.copytree(studies[name], folder / "out")
     assert cli.main(["plot", "out", "--style", "paper", "--format", "svg"]) == 0
     drawn = {path.stem: path.read_text() for path in (folder / "out").glob("*.svg")}
-    assert {key: {own for own in BOTH if own in text} for key, text in drawn.items()} == FIGURES[name]
+    assert drawn
+    for figure, text in drawn.items():
+        assert {own for own in BOTH if own in text} == IN_FIGURES.get(figure, BOTH), figure
     data = load_study(folder / "out")
     assert bool(data[NUMBER[name]].sel(estimator=[OWN, CAUTIOUS]).notnull().all())
     assert cli.main(["report", "out"]) == 0
     page = (folder / "out" / "report.html").read_text()
     assert [page.count(f"<td>{own}</td>") for own in BOTH] == [data.sizes["model"]] * 2 == [2, 2]
+
+
+def test_a_descent_with_it_goes_on_until_its_code_changes(
+    folder: Path, capsys: pytest.CaptureFixture[str], studies: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(ESTIMATORS, "registered", Registered)
+    shutil.copytree(studies["descents"], folder / "out")
+    longer = ["sweep", *ANALYTIC, *STUDIES["descents"], *CHOSEN, "--output", "out", "--iterations"]
+    assert cli.main([*longer, "3"]) == 0
+    sys.modules.pop("my_estimators")
+    (folder / "my_estimators.py").write_text(CODE.replace("sign(low.mean) ==", "sign(low.mean) !=") + HEIRS)
+    assert cli.main([*longer, "4"]) == 2
+    assert "holds another study (" in capsys.readouterr().err
 
 
 TRAP = """
@@ -160,20 +132,17 @@ def test_reading_imports_nothing(studies: dict[str, Path], folder: Path) -> None
     assert "<td>Cautious</td>" in page and "<td>Registered</td>" in page
 
 
-def test_landscape_takes_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its slope along one parameter is that of one order or the other, as the page says."""
-    line = ["--points", "3", "--direction", "0", "--span=-1,1", "--samples", "4", "--output", "out"]
-    found = document(capsys, "landscape", *ANALYTIC, *line, "--estimators", f"zobg,fobg,{OWN}")
-    assert found["estimators"] == ["zobg", "fobg", OWN] and (folder / "out" / "landscape.png").is_file()
-    for curve in found["curves"]:
-        zeroth, first, mine = np.array(curve["slope"], float)
-        assert np.all(np.isclose(mine, zeroth, rtol=1e-9) | np.isclose(mine, first, rtol=1e-9))
+def test_its_slope_along_a_parameter_is_that_of_one_order(studies: dict[str, Path]) -> None:
+    slope = load_study(studies["landscapes"])["slope"]
+    zeroth, first, mine = (slope.sel(estimator=name).values for name in ("zobg", "fobg", OWN))
+    assert np.all(np.isclose(mine, zeroth, rtol=1e-9) | np.isclose(mine, first, rtol=1e-9))
 
 
 def test_findings_report_its_bias(capsys: pytest.CaptureFixture[str]) -> None:
     """The mean of one is twice the gradient; that of the other is right."""
-    arguments = ["--samples", "400", "--reference-samples", "400", "--estimators", f"{DOUBLED},{CAUTIOUS}"]
-    found = document(capsys, "compare", *ANALYTIC, *arguments)["findings"]
+    arguments = ["--samples", "400", "--reference-samples", "400", "--estimators", f"{DOUBLED},{CAUTIOUS}", "--json"]
+    assert cli.main(["compare", *ANALYTIC, *arguments]) == 0
+    found = json.loads(capsys.readouterr().out)["findings"]
     (told,) = (sentence for sentence in found if "mean is" in sentence)
     assert told.startswith("reference: Doubled's mean is biased by") and re.search(r"\b10\b.*\b100 N/m", told)
     for share, error in re.findall(r"([\d.]+) ± ([\d.]+) %", told):
@@ -196,7 +165,8 @@ def test_gradcheck_takes_it(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_examples_of_estimators_with_required_options_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
-    entries = document(capsys, "estimators")["estimators"]
+    assert cli.main(["estimators", "--json"]) == 0
+    entries = json.loads(capsys.readouterr().out)["estimators"]
     needy = [entry for entry in entries if entry["requires"]]
     assert [entry["name"] for entry in needy] == ["fobg_clipped", "fobg_truncated"]
     for entry in needy:
@@ -209,15 +179,10 @@ def test_examples_of_estimators_with_required_options_are_accepted(capsys: pytes
     ("source", "message"),
     [
         (None, "choose from zobg, .*, or module:name of your own \\(there is no module 'my_estimators' here or"),
-        ("1 +", "importing my_estimators raised SyntaxError"),
-        ("def other(): ...", "my_estimators has no 'SignAgreement'; it has other"),
         ("SignAgreement = 3", "SignAgreement is neither an Estimator nor an Estimator class, but of type int"),
         (CODE.replace("combine", "mix"), "SignAgreement has no combine: an Estimator needs them"),
         (CODE.replace('"differentiation"', '"gradients"'), "needs gradients; the oracles are evaluation, pair, "),
-        (
-            CODE.replace(': str = "zero_noise"', ": str").replace("baseline", "level"),
-            "needs the option `level`; set it",
-        ),
+        (CODE.replace(': str = "zero_noise"', ": str").replace("baseline", "level"), "needs the option `level`; set"),
     ],
 )
 def test_mistakes_get_one_line(

