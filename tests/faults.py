@@ -142,11 +142,11 @@ def _traced(ptrace: Any, work: Callable[[], Any]) -> int:
 
 
 @contextmanager
-def deadline(seconds: float) -> Generator[None]:
-    """Raises TimeoutError inside once the time is up, also out of a system call that waits."""
+def deadline(seconds: float, error: type[BaseException] = TimeoutError) -> Generator[None]:
+    """Raises an error inside once the time is up, also out of a system call that waits."""
 
     def late(*_: object) -> None:
-        raise TimeoutError(f"no answer in {seconds} s")
+        raise error(f"no answer in {seconds} s")
 
     before = signal.signal(signal.SIGALRM, late)
     signal.setitimer(signal.ITIMER_REAL, seconds)

@@ -93,13 +93,15 @@ def test_a_formula_that_needs_gaussian_noise_refuses_another() -> None:
         task.replace(noise="cauchy")
 
 
-@pytest.mark.parametrize("noise", ["gaussian", "laplace"])
-def test_a_reference_draws_the_noise_that_mjx_draws(noise: str) -> None:
-    """Same keys, same density: the pusher's two simulations differ by the contact's impedance and nothing else."""
-    task = make_task("pusher", horizon=20).replace(noise=noise)
+def test_a_reference_draws_the_noise_that_mjx_draws() -> None:
+    """Same keys, same density: the pusher's two simulations differ by the contact's impedance and nothing else.
+
+    `test_pusher` has the same of Gaussian noise.
+    """
+    task = make_task("pusher", horizon=20).replace(noise="laplace")
     (cell,), _ = family_grid(task, ["penalty"], [100.0])
     assert task.reference is not None
-    reference = dataclasses.replace(task.reference(100.0), noise=noise)  # type: ignore[type-var]
+    reference = dataclasses.replace(task.reference(100.0), noise="laplace")  # type: ignore[type-var]
     keys = jax.random.split(jax.random.key(2), 4)
     ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, keys)
     theirs = reference.evaluate(task.theta, jax.random.clone(keys))

@@ -68,17 +68,10 @@ def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("from tests.carts import cart\n")
     compare = "compare mine:cart --contact mjcf --samples 20 --reference-samples 20"
     optimise = "optimise mine:cart --iterations 2 --samples 8 --learning-rate 0.1 --evaluation-samples 20 --seeds 2"
+    other = f"{optimise} --samples 9 --learning-rate 0.2 --seeds 3 --seed 4"
+    others = f"{compare} --samples 30 --seed 1 --chunk-size 60", "landscape mine:cart --samples 20 --points 3"
     first, again, others, line, descents, later, more = builds_of(
-        tmp_path,
-        compare,
-        compare,
-        f"{compare} --samples 30 --seed 1 --chunk-size 60",
-        "landscape mine:cart --samples 20 --points 3",
-        optimise,
-        optimise,
-        optimise.replace("samples 8 --learning-rate 0.1", "samples 9 --learning-rate 0.2").replace(
-            "seeds 2", "seeds 3 --seed 4"
-        ),
+        tmp_path, compare, compare, *others, optimise, optimise, other
     )
     assert sorted(set(first["built"]) & LARGE) == ["gradient", "numbers_of_seeds", "value"]
     for found in (first, again, others, line, descents, later, more):

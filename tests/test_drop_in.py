@@ -19,7 +19,7 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
 from mjx_study.simulation.dynamics import initial_state
-from mjx_study.simulation.onset import corrected_rollout
+from mjx_study.simulation.onset import check_onset, corrected_rollout
 from mjx_study.simulation.patches import patched
 from tests.scenes import (
     CASES,
@@ -365,6 +365,8 @@ def test_the_onset_term_is_of_first_order() -> None:
         step(model, data, onset="smooth")
     with pytest.raises(ValueError, match="unknown onset of a step 'smooth'"), differentiable_mjx(onset="smooth"):
         pass
+    with pytest.raises(ValueError, match="unknown onset 'exact'; choose from none, linear, jump"):
+        check_onset("exact")
     with pytest.raises(TypeError, match="of first order: it has no second derivative"):
         jax.hessian(lambda mass: step(model.replace(body_mass=mass), data, onset="linear").qpos[0])(model.body_mass)
 

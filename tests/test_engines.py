@@ -19,6 +19,7 @@ from experiments.engines.judge import combined, measure, verdict
 from experiments.engines.page import CELLS, CHECKS, PAGE, cells, tables
 from experiments.engines.scenes import RADIUS, SCENES, TIMESTEPS, mjcf
 from experiments.pages import replace_tables
+from tests.processes import run_script
 
 SMALL = {"grid": 100, "strata": 100, "points": 20}
 
@@ -222,7 +223,4 @@ def test_a_number_that_ways_disagree_on_is_not_certified(name: str) -> None:
 
 def test_references_need_no_more_than_numpy() -> None:
     script = "import sys; import references; print(sorted({'jax', 'mujoco', 'experiments'} & set(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=references.__file__.rpartition("/")[0], capture_output=True
-    )
-    assert done.stdout.strip() == b"[]", done.stderr
+    assert run_script(script, cwd=Path(references.__file__).parent).stdout.strip() == "[]"

@@ -149,18 +149,9 @@ def test_the_value_is_the_functions(name, native, monkeypatch):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "elementwise",
-        "computed index",
-        "computed indices of large arrays",
-        "add to one place twice",
-        "products",
-        "products of what is computed",
-        "sums",
-        "sums along any axis",
-        "reductions",
-    ],
-)
+    ["elementwise", "computed index", "computed indices of large arrays", "add to one place twice", "products",
+     "products of what is computed", "sums", "sums along any axis", "reductions"],
+)  # fmt: skip
 def test_both_modes_differentiate_it(name):
     def total(function, x):
         return sum(jnp.sum(jnp.sin(jnp.asarray(leaf, float))) for leaf in jax.tree.leaves(function(x)))

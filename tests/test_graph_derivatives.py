@@ -121,21 +121,6 @@ def test_what_a_selection_leaves_out_does_not_count_in_reverse_mode() -> None:
     assert not np.all(np.isfinite(broken))
 
 
-def test_several_cases_and_mixed_precision() -> None:
-    def function(x: Any, y: Any) -> Any:
-        which = jnp.int32(jnp.floor(x[0])) % 3
-        return lax.select_n(which, x[1], x[2] * y, jnp.sin(y)), (x.astype(jnp.float32) * 2).astype(float)
-
-    slope = derivative(captured(function, ROW, 1.0), (0, 1))
-    for first in (0.5, 1.5, 2.5):
-        point = (jnp.array([first, 0.7, -2.0]), jnp.array(0.3))
-        change = (jnp.array([1.0, 0.25, -3.0]), jnp.array(0.5))
-        result, back = jax.vjp(function, *point)
-        all_close(value(slope.push, *point, *change), jax.jvp(function, point, change)[1], 1e-6)
-        adjoint = jax.tree.map(jnp.cos, result)
-        all_close(value(slope.transposed.push, *point, *adjoint), back(adjoint), 1e-6)
-
-
 def rotation(x: Any) -> Any:
     """With what a step has: products, divisions, norms, branches, and a table."""
     axis = x / jnp.sqrt(jnp.sum(x**2))

@@ -21,17 +21,16 @@ from scipy.linalg import expm
 
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import initial_state, rollout
-from tests.scenes import floor_scene, option, scene_of
+from tests.scenes import DROP, floor_scene, option, scene_of
 
 STIFFNESS, SPEED, APPROACH, CONTACT = 1e4, 1.0, 0.01, 0.01  # [1/s^2], [m/s] at the onset, [s], [s]
-BODY = '<body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/><geom name="ball" size="0.1" mass="1" condim="1"/></body>'
 PHASES = 64
 
 
 @functools.cache
 def program(timestep: float):
     """Last (gap, velocity) and its derivative by the initial gap, of a batch; compiled once for all contacts."""
-    scene = scene_of(floor_scene(BODY, option(timestep, 'gravity="0 0 0"', 'refsafe="disable"'), 'condim="1"'))
+    scene = scene_of(floor_scene(DROP, option(timestep, 'gravity="0 0 0"', 'refsafe="disable"'), 'condim="1"'))
     horizon = round((APPROACH + CONTACT) / timestep)
 
     def last(gap, speed, damping, impedance, gravity):

@@ -86,6 +86,7 @@ def test_symmetries_hold(path: str, law: Law, speed: float, gap: float, steps: i
     assert min(abs(float(reverse[name])) for name in (*time, *mass)) > 1e-6
 
 
+@pytest.mark.slow
 def test_rollouts_have_the_derivatives_of_the_drop_in_step() -> None:
     """To rounding, where both take the touch's velocity to be the same: without gravity, of one onset with friction."""
     scene = scene_of(floor_scene(slider(), option(2e-3, 'gravity="0 0 0"', 'refsafe="disable"')))

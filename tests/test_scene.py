@@ -2,8 +2,6 @@
 
 import dataclasses
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ from mjx_study.simulation.scene import (
     put_scene,
 )
 from mjx_study.tasks import make_task
+from tests.processes import run_script
 from tests.scenes import FREE_BOX, floor_scene, slider
 
 FREE = '<body pos="0 0 1"><freejoint/><geom size=".1" condim="{}"/></body>'
@@ -47,8 +46,7 @@ def test_shipped_models_load_by_name() -> None:
 def test_a_name_needs_no_particular_working_directory(tmp_path: Path) -> None:
     (tmp_path / "pusher").mkdir()  # such as the folder of its study
     code = "from mjx_study.simulation.scene import load_scene; print(load_scene('pusher').host.nq)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (0, "2\n"), done.stderr
+    assert run_script(code, cwd=tmp_path).stdout == "2\n"
 
 
 ENUMERATED = {

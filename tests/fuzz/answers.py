@@ -9,7 +9,6 @@ import dataclasses
 import hashlib
 import io
 import re
-import signal
 import stat
 from collections import Counter
 from collections.abc import Generator
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mjx_study import cli
+from tests.faults import deadline
 
 SECONDS: Final = 20
 """Maximum time for an input [s]."""
@@ -60,7 +60,7 @@ class Row:
         """Count an input, and an answer that is wrong, comes too late or is a traceback."""
         self.inputs += 1
         try:
-            with limited(SECONDS):
+            with deadline(SECONDS, TooSlow):
                 yield
         except KeyboardInterrupt:
             raise
@@ -114,19 +114,3 @@ def contents_of(folder: Path) -> dict[str, str]:
             is_file = stat.S_ISREG(mode) and mode & 0o400
             found[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else oct(mode)
     return found
-
-
-@contextlib.contextmanager
-def limited(seconds: int) -> Generator[None]:
-    """Raise TooSlow within the context once it has taken so long."""
-
-    def late(*_: Any) -> None:
-        raise TooSlow(f"no answer in {seconds} s")
-
-    previous = signal.signal(signal.SIGALRM, late)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, previous)

@@ -47,7 +47,11 @@ def copy_of_the_tree() -> Generator[Path]:
     """A copy without what is not part of the project; it shares the cache of compiled programs."""
     with tempfile.TemporaryDirectory(prefix="planted-") as folder:
         tree = Path(folder) / "tree"
-        shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(*LEFT_OUT), symlinks=True)
+        left_out = shutil.ignore_patterns(*LEFT_OUT)
+        # of the root alone: mjx_study has a package of the name results
+        shutil.copytree(
+            ROOT, tree, ignore=lambda at, names: left_out(at, names) if at == str(ROOT) else [], symlinks=True
+        )
         cache_folder = ROOT / ".pytest_cache" / "jax"
         cache_folder.mkdir(parents=True, exist_ok=True)
         (tree / ".pytest_cache").mkdir()
