@@ -75,13 +75,13 @@ def failing_test(tree: Path, *arguments: str) -> str:
     """The first fast test that fails, or "".
 
     Raises:
-        RuntimeError: pytest could not run them.
+        RuntimeError: pytest could not run them, or import their file.
     """
     done = run(tree, "pytest", "-q", "-x", "-p", "no:cacheprovider", *arguments)
     if done.returncode == 0:
         return ""
     for line in done.stdout.splitlines():
-        if line.startswith(("FAILED ", "ERROR ")):
+        if line.startswith(("FAILED ", "ERROR ")) and "::" in line:
             return line.split(" - ")[0].split(maxsplit=1)[1]
     raise RuntimeError(f"pytest {' '.join(arguments)} ended with code {done.returncode}:\n{done.stdout}{done.stderr}")
 
