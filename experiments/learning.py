@@ -62,8 +62,7 @@ SAMPLES: Final = 128  # rollouts per iteration, of both orders together
 ITERATIONS: Final = 150
 RATES: Final = (2e-3, 5e-3, 1e-2)  # learning rates of Adam
 PIECES: Final = {"walk": 8, "hopper": 4}  # pieces of a rollout
-WINDOWS: Final[dict[str, tuple[int, ...]]] = {"walk": (2, 4, 8), "hopper": (4,)}
-"""Pieces between cuts of the adjoint."""
+WINDOWS: Final[dict[str, tuple[int, ...]]] = {"walk": (2, 4, 8), "hopper": (4,)}  # pieces between cuts of the adjoint
 GAMMAS: Final[dict[str, tuple[float, ...]]] = {"walk": (100.0, 200.0, 400.0), "hopper": (40.0, 80.0, 160.0)}
 """AoBG's bounds: about half, once and twice the radius of the zeroth-order mean at the start."""
 FOOT: Final = {"walk": "front_left_foot", "hopper": "foot"}

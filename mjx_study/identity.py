@@ -30,8 +30,7 @@ NOT_COMPUTING: Final = frozenset(
     "authoring cli plots render gradcheck diagnose claims bench.py report.py _public.py __main__.py".split()
 )
 """Parts of mjx_study that no study imports while it computes, and so do not affect results; all others count."""
-DIGEST: Final = re.compile("[0-9a-f]{12,64}")
-"""Digests, which messages do not show."""
+DIGEST: Final = re.compile("[0-9a-f]{12,64}")  # digests, which messages do not show
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
 """Advice at the end of messages about other versions."""
 

@@ -21,8 +21,7 @@ from mjx_study.version import version_of
 
 _TRACES: Final[list[Path]] = []
 _CORES: Final[list[int]] = []
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _KEPT = -1, -3, 1 << 30
-"""Parameters of `mallopt`, and their value [bytes]."""
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _KEPT = -1, -3, 1 << 30  # parameters of `mallopt`, and their value [bytes]
 _POOL: Final = "PJRT_NPROC"
 """Environment variable with the size of XLA's thread pools; read when JAX sets up its devices."""
 

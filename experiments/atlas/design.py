@@ -23,8 +23,7 @@ from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 FAMILIES: Final = ("penalty", "impedance", "mujoco", "mujoco_stiff", "smooth_onset")
-UNDAMPED: Final = ("penalty", "impedance")
-"""Families that keep the task's damping; the others' damping ratio varies."""
+UNDAMPED: Final = ("penalty", "impedance")  # families that keep the task's damping; the others' damping ratio varies
 POINTS: Final = 128  # number of cells of each family at each task and timestep
 DAMPRATIO: Final = (0.1, 2.0)
 WIDTH: Final = (3e-4, 3e-2)  # depths over which the impedance of `smooth_onset` rises [m]

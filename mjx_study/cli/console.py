@@ -40,8 +40,7 @@ DESCENT_COLUMNS: Final = ("final_cost", "best_cost", "alpha", "seed_rollouts", "
 """Columns of the table of `optimise`, a task's metrics after the second."""
 CHOSEN: Final = ("theta", "gamma", "onset", "noise", "baseline", "weights", *SCENE_OPTIONS)
 """Options that the header of a table states where they are given."""
-MOST_SHOWN: Final = 3
-"""Maximum number of parameters printed."""
+MOST_SHOWN: Final = 3  # maximum number of parameters printed
 
 
 def _debiased(row: Row, name: str) -> str:

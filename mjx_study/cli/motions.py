@@ -31,12 +31,10 @@ from mjx_study.tasks.contact_grid import ContactPoint, single_contact
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Task
 
-FILE_SECONDS: Final = 2.0
-"""Duration of a file's rollout without --horizon [s]."""
+FILE_SECONDS: Final = 2.0  # duration of a file's rollout without --horizon [s]
 OF_TASKS: Final = ("contact", "stiffness", "damping", "smoothing", "noisy", "sigma", "theta", "model", "seed")
 """Options that a file does not read."""
-MOST_BODIES_LISTED: Final = 12
-"""Maximum number of bodies, and of joints, whose final positions are printed."""
+MOST_BODIES_LISTED: Final = 12  # maximum number of bodies, and of joints, whose final positions are printed
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,8 +29,7 @@ from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.table import as_plain, digits_to_tell_apart, format_table, size
 
 KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
-MOST_ROWS = 40
-"""Maximum number of rows of the table at the end of a sweep; the report has all."""
+MOST_ROWS = 40  # maximum number of rows of the table at the end of a sweep; the report has all
 INTACT = "existing files are complete, and the same command resumes"
 
 

@@ -34,8 +34,7 @@ TRIES: Final = 3
 """Attempts at a work unit before its cell counts as failed."""
 CONNECT_SECONDS: Final = 30
 """Timeout for reaching a scheduler."""
-POLL_SECONDS: Final = 1.0
-"""Interval between polls of the workers."""
+POLL_SECONDS: Final = 1.0  # interval between polls of the workers
 SELDOM: Final = {
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",

@@ -28,8 +28,7 @@ from mjx_study.storage.folder import Store, open_store
 from mjx_study.storage.manifest import document_of
 from mjx_study.table import as_plain
 
-WAIT_SECONDS: Final = 0.5
-"""Interval between polls of cells that another process computes."""
+WAIT_SECONDS: Final = 0.5  # interval between polls of cells that another process computes
 
 
 def run_study(

@@ -46,8 +46,7 @@ from mjx_study.table import number
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Recipe, Task
 
-HISTORY_NUMBERS: Final = 20
-"""Approximate count of numbers kept per iteration and seed, over all estimators."""
+HISTORY_NUMBERS: Final = 20  # approximate count of numbers kept per iteration and seed, over all estimators
 REPORT_EVERY: Final = 10
 """Iterations between progress reports, which wait for the device."""
 SAVE_SECONDS: Final = 20.0

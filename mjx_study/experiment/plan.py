@@ -29,8 +29,7 @@ from mjx_study.tasks.network import with_network
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task, check_shapes
 
-LONG_IN_NUMPY: Final = 10_000_000
-"""Steps, a minute or so, from which a study says that NumPy computes them."""
+LONG_IN_NUMPY: Final = 10_000_000  # steps, a minute or so, from which a study says that NumPy computes them
 
 
 def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, single: bool = False) -> StudyPlan:

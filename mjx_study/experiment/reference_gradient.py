@@ -32,8 +32,7 @@ CANDIDATES: Final = 100
 
 TARGET: Final = 0.05
 """Relative uncertainty with which a reference tells a notable bias from none."""
-MOST_PARTS: Final = 32
-"""Maximum number of references that are averaged to reach it."""
+MOST_PARTS: Final = 32  # maximum number of references that are averaged to reach it
 MOST_STEPS: Final = {True: 2_000_000, False: 100_000}
 """Maximum number of simulated steps for that, about ten seconds of a core, for models whose step is a graph and for
 others; not a time, so that numbers are the same on any machine."""

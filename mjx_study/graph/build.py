@@ -40,8 +40,7 @@ QUICKLY: Final = "-O1", "-fschedule-insns2"
 WELL: Final = ("-O2",)
 MOST_SECONDS: Final = 600
 """Maximum time for a compiler to run [s]."""
-PREFIX: Final = "mjx_study_"
-"""Beginning of the names of libraries, which are those of their XLA targets."""
+PREFIX: Final = "mjx_study_"  # beginning of the names of libraries, which are those of their XLA targets
 
 _BUILT: Final[dict[str, Future[Any]]] = {}
 """Handlers by name, None where the build failed; their libraries stay loaded."""

@@ -31,8 +31,7 @@ _TYPES: Final = (*("float64", "float32", "int64", "int32", "int16", "int8", "uin
 NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for name in _TYPES} | {np.dtype(bool): "mask"}
 
 
-MAX_ARGUMENT: Final = 4000
-"""Maximum size of a kernel's argument [bytes]."""
+MAX_ARGUMENT: Final = 4000  # maximum size of a kernel's argument [bytes]
 MOST_TOGETHER: Final = {"cpu": (500, 500), "gpu": (20_000, 20_000), "gpu, long": (5_000, 20_000)}
 """Maximum numbers of lines in a function and in a loop that stays in one; compilers allocate registers in more than
 linear time."""

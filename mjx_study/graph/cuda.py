@@ -12,8 +12,7 @@ import jax
 
 MOST_OPTIMISED: Final = 300_000
 """Maximum length of a source [characters] that is worth full optimisation, which in longer ones spills registers."""
-LESS: Final = ("--ptxas-options=-O1",)
-"""Options for longer ones."""
+LESS: Final = ("--ptxas-options=-O1",)  # options for longer ones
 QUICKLY: Final = "--Ofast-compile=min", "--split-compile=0"
 """Options for kernels that are `LONG`: a third of the time of `LESS`, on all cores; of NVRTC from 12.9 on."""
 _INVALID_OPTION: Final = 5

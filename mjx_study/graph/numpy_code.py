@@ -25,11 +25,9 @@ BLOCK: Final = 2048
 """Samples computed together: with fewer, Python takes longer than NumPy."""
 BEGINNING: Final = "# NumPy"
 """First line of a source."""
-MOST_IDLE: Final = 0.75
-"""Share of lanes below which those in which a loop has ended are left out."""
+MOST_IDLE: Final = 0.75  # share of lanes below which those in which a loop has ended are left out
 _HANDLER: Final = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
-_INVALID: Final = 13
-"""XLA's code of an internal error."""
+_INVALID: Final = 13  # XLA's code of an internal error
 
 
 def python_source(function: ScalarFunction, passes: Passes | None = None) -> str:

@@ -20,15 +20,13 @@ CPU_CHUNKS: Final = (11, 101, 201)
 programs; one more than round numbers, for the baseline."""
 MANY: Final = 2000
 """Samples from which a CPU takes the largest chunks, which pay for another program."""
-IN_TURN: Final = (16, 56)
-"""The same in a program that takes batches in turn, as native code in vectors of eight."""
+IN_TURN: Final = (16, 56)  # the same in a program that takes batches in turn, as native code in vectors of eight
 IN_NUMPY: Final = 2001
 """Samples per call where NumPy stands in for native code, which leaves out copies: an operation takes 0.3 us for 100
 samples, 0.6 for 2,000."""
 MAX_CHUNK: Final = {"cpu": CPU_CHUNKS[-1], "gpu": 2**17 + 1, "tpu": 2**17 + 1}
 """Maximum number of samples per device and call, by backend."""
-MAX_SHARE: Final = 0.25
-"""Maximum share of an accelerator's memory for the gradients of a chunk."""
+MAX_SHARE: Final = 0.25  # maximum share of an accelerator's memory for the gradients of a chunk
 
 
 def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: int, devices: Sequence[Any]) -> Any:

@@ -31,8 +31,7 @@ UNSET_MJCF: Final = "the MJCF's"
 DEFAULT_KIND: Final = "gradients"
 ASKED_BY: Final = {"descents": "iterations", "landscapes": "points"}
 """Options that ask for a kind of study where none is given."""
-NEEDED: Final = {"landscapes": "points"}
-"""Options without which there is no such study."""
+NEEDED: Final = {"landscapes": "points"}  # options without which there is no such study
 SAMPLES: Final = 100
 """Samples per batch unless the configuration or a recipe sets another number."""
 AXES: Final = (

@@ -13,8 +13,7 @@ from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_t
 from mjx_study.options.configuration import BUILDER_OPTIONS, CONTACTS, ESTIMATOR_OPTIONS, OPTIONS, UNSET_TASK
 from mjx_study.options.option import Option, OptionError, flag_of
 
-SIMILAR_FLAGS: Final = 0.75
-"""Least similarity of a flag that is suggested, which its dashes add to."""
+SIMILAR_FLAGS: Final = 0.75  # least similarity of a flag that is suggested, which its dashes add to
 TASK_OPTIONS: Final = ("timestep", "cone", *BUILDER_OPTIONS)
 """Options for the builder of a task."""
 SWEEP: Final = "the task's sweep"

@@ -18,14 +18,11 @@ from mjx_study.table import number, plural
 
 MOST_COST_RATIO: Final = 1e7
 """Maximum ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""
-MOST_SLOPE_RATIO: Final = 10
-"""Maximum ratio of the slopes shown to the steepest of the mean cost."""
+MOST_SLOPE_RATIO: Final = 10  # maximum ratio of the slopes shown to the steepest of the mean cost
 MOST_UNRESOLVED: Final = 0.5
 """Share of the points of a curve whose intervals contain 0 from which on it does not set the limits of an axis."""
-ROOM_AT_ZERO: Final = 0.05
-"""Room beyond zero on an axis of slopes, as a share of the rest."""
-MIDDLE_AND_ENDS: Final = (0.5, 0, 1)
-"""Quantiles of the seeds that a descent shows."""
+ROOM_AT_ZERO: Final = 0.05  # room beyond zero on an axis of slopes, as a share of the rest
+MIDDLE_AND_ENDS: Final = (0.5, 0, 1)  # quantiles of the seeds that a descent shows
 
 
 def achieved(part: xr.Dataset, title: str) -> Figure | None:

@@ -23,10 +23,8 @@ MOST_PANELS: Final = 6
 SHIFT_RATIO: Final = 1.05
 """Ratio of the stiffnesses at which neighbouring estimators are drawn where they would hide each other."""
 UNDRAWN: Final = "no finite number (below: 0)"
-INSET: Final = 0.03
-"""Distance of crosses from the edges and half of that between them, as a share of the axis."""
-EXTRA: Final = 1e3
-"""Maximum ratio by which an axis goes on for contact models that it does not follow."""
+INSET: Final = 0.03  # distance of crosses from the edges and half of that between them, as a share of the axis
+EXTRA: Final = 1e3  # maximum ratio by which an axis goes on for contact models that it does not follow
 LARGEST: Final = 1e140
 """Size to which numbers are limited, and the inverse of the smallest positive one: their squares do not overflow."""
 

@@ -20,10 +20,8 @@ from mjx_study.results.rows import onset_of
 from mjx_study.results.variables import COORDINATES, Variable
 from mjx_study.table import digits_to_tell_apart
 
-MAX_FIGURES: Final = 12
-"""Maximum number of figures of one kind; further tasks, timesteps and noises are dropped."""
-MOST_DECADES: Final = 6
-"""Maximum ratio of FoBG to ZoBG, or of ZoBG to FoBG, that a map tells apart, as a power of ten."""
+MAX_FIGURES: Final = 12  # maximum number of figures of one kind; further tasks, timesteps and noises are dropped
+MOST_DECADES: Final = 6  # maximum ratio of FoBG to ZoBG, or of ZoBG to FoBG, that a map tells apart, as a power of ten
 
 
 def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:

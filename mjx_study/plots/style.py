@@ -170,8 +170,7 @@ def save_figures(figures: Mapping[str, Figure], folder: Path, formats: Sequence[
     return [path for name, figure in figures.items() for path in save_figure(figure, folder, name, formats)]
 
 
-MOST_POINTS: Final = 15
-"""Maximum number of points of a curve each of which has a marker; of longer curves a few have."""
+MOST_POINTS: Final = 15  # maximum number of points of a curve each of which has a marker; of longer curves a few have
 
 
 def line_with_band(
@@ -198,8 +197,7 @@ def line_with_band(
         axes.errorbar(x, y, yerr=bars, color=color, capsize=3, linestyle="none")
 
 
-ARROWHEAD: Final = 5.5
-"""Height of an arrowhead with the room around it [points]."""
+ARROWHEAD: Final = 5.5  # height of an arrowhead with the room around it [points]
 
 
 def mark_clipped(figure: Figure) -> None:

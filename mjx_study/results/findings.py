@@ -14,12 +14,10 @@ from estimators import ESTIMATORS, ORACLES
 from mjx_study.results.rows import BIASED_P_VALUE, SETTING, Row, label_in, rows_of
 from mjx_study.table import digits_to_tell_apart, grouped, percent, with_error
 
-OFF_SE: Final = 4.0
-"""Standard errors beyond which a mean without a verdict is reported as off."""
+OFF_SE: Final = 4.0  # standard errors beyond which a mean without a verdict is reported as off
 NOTABLE_SHARE: Final = 0.05
 """Share of the largest slope beyond which a difference free of sampling error is reported."""
-MOST_UNCERTAINTY: Final = 0.2
-"""Relative uncertainty beyond which a reference is too imprecise to judge errors."""
+MOST_UNCERTAINTY: Final = 0.2  # relative uncertainty beyond which a reference is too imprecise to judge errors
 ERROR_PER_STRENGTH: Final = 0.5
 """Error of the linear onset term's mean, as a share of what the term adds, over the onset strength. Among 11 contact
 models on momentum_transfer and ball_wall the largest was 0.26; at random thetas the atlas has larger ones, at grazing

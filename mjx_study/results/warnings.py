@@ -10,8 +10,7 @@ from estimators import ENOUGH_EFFECTIVE
 from estimators.registry import label_of
 from mjx_study.results.rows import onset_of
 
-MOST_NAMED: Final = 3
-"""Maximum number of contact models that a warning names."""
+MOST_NAMED: Final = 3  # maximum number of contact models that a warning names
 EXPLODED: Final = 1e30
 """Size of a gradient, variance or cost that no stable step reaches."""
 SIZES: Final = ("gradient_norm", "variance", "cost", "final_cost")

@@ -41,10 +41,8 @@ OWN_SOLVER: Final = True
 """Whether small systems use the solver below instead of MJX's; tests compare both."""
 NEWTON_STEPS: Final = 30
 LINE_SEARCH_STEPS: Final = 4
-MOST_ROUNDINGS: Final = 8
-"""Tolerance of the solver's equation in rounding errors of its terms."""
-GENEROUS: Final = (100, 50)
-"""Iterations of the solver and its line search in `solve_to_rounding`."""
+MOST_ROUNDINGS: Final = 8  # tolerance of the solver's equation in rounding errors of its terms
+GENEROUS: Final = (100, 50)  # iterations of the solver and its line search in `solve_to_rounding`
 POLISHING_STEPS: Final = 4
 EPSILON: Final = 1e-14
 """Relative rounding error of a force in the solver's equation."""

@@ -39,8 +39,7 @@ from mjx_study.simulation.scene import Scene
 
 PACKAGE: Final = "mujodico"
 INSTALL: Final = "needs MuJoDiCo: pip install 'mjx-study[laws]'"
-STIFFNESS_SCALE: Final = 100.0
-"""MuJoDiCo's stiffness [N/m] over MuJoCo's k / d_width^2 [1/s^2]."""
+STIFFNESS_SCALE: Final = 100.0  # MuJoDiCo's stiffness [N/m] over MuJoCo's k / d_width^2 [1/s^2]
 BUDGET: Final = {"tolerance": 1e-13, "iterations": 50, "ls_tolerance": 1e-28, "ls_iterations": 8}
 """Of MuJoDiCo's solvers, whose derivative is only as good as their solution. With its line search run to 1e-12 J, as
 the steps get small none of them is whole, and the last of 1e-12 m/s leaves as much."""

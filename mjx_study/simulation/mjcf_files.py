@@ -16,11 +16,9 @@ from typing import Final
 from mjx_study.disk import read_bytes
 
 _FOLDERS: Final = ("meshdir", "texturedir", "assetdir")
-_FILE: Final = re.compile("file.*")
-"""Attributes that name files, of URDF as well."""
+_FILE: Final = re.compile("file.*")  # attributes that name files, of URDF as well
 _NAMES: Final = ("name", "class", "dclass", "childclass", "prefix")
-_MODELS: Final = ("include", "model")
-"""Elements whose file is an MJCF."""
+_MODELS: Final = ("include", "model")  # elements whose file is an MJCF
 DEEPEST: Final = 50
 """Limit on the nesting of files."""
 MOST_ASSET_BYTES: Final = 1_000_000_000
@@ -51,8 +49,7 @@ _GRID: Final = "10 10 10"  # of a flexcomp without count
 _UNITS: Final = {"K": 2.0**10, "M": 2.0**20, "G": 2.0**30, "T": 2.0**40, "P": 2.0**50, "E": 2.0**60}
 _TEXTS: Final = re.compile("name|.*class|model|file.*|.*dir|prefix|instance|plugin|content_type")
 """Attributes whose value is text, whatever it looks like."""
-_OF_TEXT: Final = ("text", "config")
-"""Elements whose attributes are text."""
+_OF_TEXT: Final = ("text", "config")  # elements whose attributes are text
 _NUMBER: Final = re.compile(
     r"([+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?))(?:(?<=nan)\(\w*\))?", re.IGNORECASE
 )

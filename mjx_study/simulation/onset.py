@@ -77,8 +77,7 @@ from mjx_study.simulation.touch import Changes, Events, OnsetCounts, Past, Touch
 
 SLOTS: Final = 32
 """Minimum number of slots of a rollout for events to correct; later events are only counted."""
-SLOTS_PER_GUARD: Final = 8
-"""Slots per contact or limit of the scene."""
+SLOTS_PER_GUARD: Final = 8  # slots per contact or limit of the scene
 TOGETHER: Final = 8
 """Number of events that an accelerator computes in the time of one."""
 

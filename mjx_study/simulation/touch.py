@@ -27,8 +27,7 @@ CHATTER: Final = 2.2
 down, one over the larger of `guards.relaxation_rates`: a little more than `solref`'s time constant where damping is
 critical."""
 
-LONG_AGO: Final = 1_000_000
-"""Steps before the first event of a contact."""
+LONG_AGO: Final = 1_000_000  # steps before the first event of a contact
 
 
 Flags = Bool[Array, " slots"]

@@ -21,18 +21,14 @@ from mjx_study.options.files import read_npy, validated
 from mjx_study.results.kind import StudyResults, find_kind
 from mjx_study.results.variables import ONSETS, with_metrics
 
-MOST_CELL_BYTES: Final = 2**31
-"""Maximum size of a cell's file [bytes]."""
+MOST_CELL_BYTES: Final = 2**31  # maximum size of a cell's file [bytes]
 MOST_MEMBERS: Final = 1_000_000
 """Maximum number of arrays in a file."""
-MEMBER: Final = b"PK\x01\x02"
-"""Signature of an entry in a zip file's directory."""
+MEMBER: Final = b"PK\x01\x02"  # signature of an entry in a zip file's directory
 NUMBERS: Final = "fiub"
 """Kinds of the types that a variable may have."""
-MOST_COUNT: Final = 10**15
-"""Maximum of a variable that counts."""
-VERSIONS: Final = "versions"
-"""Entry that records the versions that computed a cell."""
+MOST_COUNT: Final = 10**15  # maximum of a variable that counts
+VERSIONS: Final = "versions"  # entry that records the versions that computed a cell
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,8 +22,7 @@ from mjx_study.options.files import digest_of_json, validated
 from mjx_study.runtime import environment
 from mjx_study.table import digits_to_tell_apart
 
-MOST_NUMBERS: Final = 500_000_000
-"""Maximum size of a variable of a study."""
+MOST_NUMBERS: Final = 500_000_000  # maximum size of a variable of a study
 SEEDS: Final = Interval(OPTIONS["seeds"].interval)
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
