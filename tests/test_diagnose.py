@@ -244,7 +244,10 @@ def test_biases_without_the_usual_explanation(found: Diagnosis) -> None:
     error = 100 * math.hypot(0.3, 2 * found.norm_error / found.norm)
     assert any(f"the onset term leaves a bias of 200 ± {error:.0f} %" in text for text in left)
     assert not any("corrects that" in text for text in left)
-    smooth = advised(found, touches=tuple(dataclasses.replace(each, jump=1e-5) for each in found.touches))
+    touches = tuple(dataclasses.replace(each, jump=1e-5) for each in found.touches)
+    limited = advised(found, touches=touches)
+    assert any("a joint's or tendon's limit sets in with a jump" in text and "solimplimit" in text for text in limited)
+    smooth = advised(found, touches=touches, onsets=found.onsets | {"onset_strength": 1e-5})
     assert any("though force sets in without a jump" in text for text in smooth)
     assert not any("sets in with a jump" in text or "solimp" in text for text in smooth)
 

@@ -18,7 +18,7 @@ EPILOG = f"""\
 examples:
   mjx-study diagnose momentum_transfer --contact mujoco_default
   mjx-study diagnose momentum_transfer --contact kelvin_voigt
-  mjx-study diagnose robot.xml                 no cost is needed: one is made from the bodies' positions
+  mjx-study diagnose robot.xml                 no cost is needed: the default is of displacements
   mjx-study diagnose robot_task:robot --theta out/policy-fobg.json       at the end of a descent
 
 columns of the contacts and of the estimators:

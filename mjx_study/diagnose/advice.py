@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from mjx_study.diagnose.measurement import SAMPLES, TARGET_ERROR
-from mjx_study.diagnose.run import Diagnosis, enough, round_up
+from mjx_study.diagnose.run import Diagnosis, enough, round_down, round_up
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
 from mjx_study.table import number, percent
 
@@ -107,13 +107,17 @@ def _bias(found: Diagnosis) -> Advice:
     by_name, timestep = {each.estimator: each for each in found.estimators}, found.task.scene.timestep
     text = f"plain first order is biased by {found.off_text(by_name['fobg'])}, "
     corrected = not found.law and by_name["fobg_onset"].verdict == "right"
-    if found.law or max([each.jump for each in found.touches] or [found.onsets["onset_strength"]]) <= SMOOTH_SHARE:
+    contacts = max((each.jump for each in found.touches), default=0.0)
+    if found.law or max(contacts, found.onsets["onset_strength"]) <= SMOOTH_SHARE:
         text += "though force sets in without a jump: something else jumps, as where corners and edges touch, "
         text += "and only zobg is sure to be unbiased"
-    elif corrected:
-        text += "because contact sets in with a jump: the onset term corrects that"
     else:
-        text += "and contact sets in with a jump, the usual cause"
+        limit = "a joint's or tendon's limit" if found.touches else "contact or a limit"
+        what = "contact" if contacts > SMOOTH_SHARE else limit
+        cause = f"because {what} sets in with a jump: the onset term corrects that"
+        text += cause if corrected else f"and {what} sets in with a jump, the usual cause"
+        if what == limit:
+            text += '; an impedance that rises from 0 has no jump: solimplimit="0 0.95 0.1" in the MJCF'
     if travel := max((each.speed * timestep for each in found.touches if each.jump > SMOOTH_SHARE), default=0.0):
         rising = f'solimp="0 0.95 {WIDTH_RATIO * travel:.1g}"'
         text += f"; an impedance that rises from 0 has no jump: {rising} in the MJCF"
@@ -140,7 +144,7 @@ def _onset(found: Diagnosis) -> Iterator[Advice]:
                 "",
             )
     elif spread < LEAST_SPREAD:
-        finer = f"--timestep {timestep * spread / LEAST_SPREAD:.1g}, or " if spread > 0 else ""
+        finer = f"--timestep {round_down(timestep * spread / LEAST_SPREAD)}, or " if spread > 0 else ""
         yield f"for fobg_onset and aobg_onset the noise is too narrow: take {finer}a larger --sigma", ""
     elif (
         corrected.verdict == "biased"
@@ -153,9 +157,9 @@ def _onset(found: Diagnosis) -> Iterator[Advice]:
             "",
         )
     elif linear > NOTABLE_SHARE:
-        step = timestep * NOTABLE_SHARE / linear
+        step = round_down(timestep * NOTABLE_SHARE / linear)
         yield (
-            f"{linear_error(strength)}: --timestep {step:.1g} brings that down to {percent(NOTABLE_SHARE)}; the "
+            f"{linear_error(strength)}: --timestep {step} brings that down to {percent(NOTABLE_SHARE)}; the "
             "error of --onset jump is only of second order in the step",
             "--onset jump",
         )

@@ -109,7 +109,7 @@ def _derivatives(found: Diagnosis) -> str:
 
 def _contact_lines(found: Diagnosis) -> list[str]:
     onsets = found.onsets.get("onsets", 0)
-    lines = [f"  contacts that begin in a rollout with noise: {onsets / found.samples:.2g}"]
+    lines = [f"  contacts and limits that begin in a rollout with noise: {onsets / found.samples:.2g}"]
     if found.law:
         before = f" a contact begins {1e3 * found.lead:.3g} ms before touch, where it acts;" if found.lead else ""
         lines.insert(0, f"  {found.law} is not MuJoCo's law:{before} onset terms and impedance do not apply")
@@ -119,11 +119,11 @@ def _contact_lines(found: Diagnosis) -> list[str]:
             share = percent(found.onsets["onset_strength"])
             lines.append(f"  approach speed that a contact takes in its first step: {share}")
         for name, what in (
-            ("missed", "since they chatter or exceed its slots"),
-            ("replaced", "since corners or edges replace others"),
+            ("missed", "they chatter, or are too many"),
+            ("replaced", "corners or edges replace others"),
         ):
             if count := found.onsets.get(f"onsets_{name}", 0):
-                lines.append(f"  contacts per rollout without an onset term {what}: {count / found.samples:.2g}")
+                lines.append(f"  per rollout, left uncorrected ({what}): {count / found.samples:.2g}")
     if not found.touches:
         return [*lines, "  contacts that begin in the rollout without noise: 0"]
     worst = sorted(found.touches, key=lambda each: (each.stable, -each.jump, -(each.travel or each.speed)))

@@ -83,6 +83,12 @@ def round_up(number: float) -> str:
     return f"{math.ceil(number / 10**digits) * 10**digits:,}"
 
 
+def round_down(number: float) -> str:
+    """Round down to one significant digit."""
+    unit = 10.0 ** math.floor(math.log10(number))
+    return f"{math.floor(number / unit) * unit:.1g}"
+
+
 def enough(found: Measurement, factor: float) -> str:
     """So many times the samples drawn, as an option, and how long they take here."""
     samples = round_up(factor * found.samples)

@@ -60,7 +60,7 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     else:
         policy, changed = InitialStatePolicy(host.nv, horizon, 0, push, _unit_of_velocities(host)), "initial velocities"
         theta, sigma = np.zeros(host.nv), NOISE
-    cost = f"half the squared displacement of {what} after {horizon} steps, by the {changed}"
+    cost = f"half the squared displacement of {what} after {horizon} steps; parameters: the {changed}"
     if _rests(host, start, theta[: host.nu], horizon, measured):
         theta, cost = theta + sigma, f"{cost}, which are raised by {sigma:g} since nothing moves otherwise"
     return Task(
