@@ -168,8 +168,8 @@ DETAILS: Final = ("gradient_norm", "effective_samples", "cosine", "epsilon", "di
 """Columns that only --details shows."""
 MARKS: Final = """\
 After the arrows: the same without the sampling noise of batch and reference, ± one standard error. Errors below two
-of them are not detected; a mean is called biased from p = 0.001, about 3.3 of them. < and >: bounds of two standard
-errors where nothing is left; -: noise explains all of it."""
+of them are not detected; a mean is called biased from p = 0.001, 3.3 of them if means are normal. < and >: bounds
+of two standard errors where nothing is left; -: noise explains all of it."""
 MEASURED: Final = ("seconds", "seconds_per_sample")
 """Measured times, the only variables that differ from run to run."""
 
