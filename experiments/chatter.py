@@ -1,4 +1,4 @@
-"""Table of docs/onset-correction.md on contacts that chatter: bias and deviation with no term, with all, and chosen.
+"""Table of docs/onset-correction.md on contacts that chatter: bias and deviation with no term, all, chosen, and shifts.
 
     python -m experiments.chatter    # three minutes on one core
 
@@ -30,7 +30,12 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
 SLOTS: Final = 192  # slots for events here, so that all get a term
-KINDS: Final = {"none": ("none", 0.0), "all": ("linear", 0.0), "chosen": ("linear", touch.CHATTER)}
+KINDS: Final = {
+    "none": ("none", 0.0),
+    "all": ("linear", 0.0),
+    "chosen": ("linear", touch.CHATTER),
+    "shift": ("shift", 0.0),
+}
 """Terms by name: the kind of onset, and the time between events below which contacts chatter."""
 
 
@@ -111,7 +116,16 @@ def main() -> None:
     lines += [row("`landing`", landing, contact, 2000, 100, 20_000, 0.02)]
     lines += [row("quadruped", robot, None, 320, 16, 1600, 0.02)]
     lines += [row("quadruped, walking", trained(robot, 120), None, 640, 16, 1600, 0.005)]
-    names = "", "slope", "E[FoBG]", "all terms", "chosen", "deviation: none, all, chosen", "events left out"
+    names = (
+        "",
+        "slope",
+        "E[FoBG]",
+        "all terms",
+        "chosen",
+        "shift",
+        "deviation: none, all, chosen, shift",
+        "events left out",
+    )
     write_tables(DOCS / "onset-correction.md", {"chatter": markdown_table(lines, names)})
 
 

@@ -3,11 +3,13 @@
 python -m experiments.onset            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
 python -m experiments.onset tennis     # means along four directions of the gains; an hour on one core
 python -m experiments.onset rule       # error of the linear term over the onset strength, 11 contact laws
+python -m experiments.onset stiffness  # bias and deviation against stiffness; two minutes
 python -m experiments.onset cost       # time of gradients with the linear term over that without; three minutes
 """
 
 import sys
 import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -25,13 +27,14 @@ from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import Simulator
 from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import configure
-from mjx_study.simulation.contact import contact_model, family_model
+from mjx_study.simulation.contact import ContactModel, contact_model, family_model
 from mjx_study.table import markdown_table, percent
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 ANGLES = {"momentum_transfer": (0.3, 0.5, 0.7), "ball_wall": (0.2, 0.7, 0.9)}
-TREATMENTS = ("none", "linear", "jump")
+TREATMENTS = ("none", "linear", "shift")
 TIMESTEPS = (0.004, 0.002, 0.001, 0.0005)
 POINTS = 20_000
 CHUNK = 1000
@@ -56,7 +59,13 @@ def measure(task: Task, angles: tuple[float, ...]) -> tuple[Means, list[list[flo
     """Return means at the angles, and standard deviations of one ZoBG and one FoBG sample, with the default contact."""
     contact = family_model("mujoco_default", task.scene, effective_mass=task.effective_mass)
     position = np.array(angles)
-    points = grid(position.min(), position.max(), task.sigma, POINTS, task.noise)
+    return measured(task, contact, grid(position.min(), position.max(), task.sigma, POINTS, task.noise), position)
+
+
+def measured(
+    task: Task, contact: ContactModel | None, points: np.ndarray, position: np.ndarray
+) -> tuple[Means, list[list[float]]]:
+    """The same with a contact model, by quadrature at some points."""
     values, slopes = Line(task)(points, contact)
     noise, deviations = NOISES[task.noise], []
     for at in position:
@@ -97,6 +106,24 @@ def tennis() -> None:
         _print(f"deviation: {name}", [f"{np.std(samples @ each, ddof=1):.0f}" for each in along])
 
 
+def stiffness() -> None:
+    """Write slopes, means and deviations of first-order gradients through springs and smooth onsets."""
+    task, position, rows = make_task("momentum_transfer"), np.array([0.5]), []
+    points = grid(0.5, 0.5, task.sigma, POINTS, task.noise)
+    for family in ("penalty", "smooth_onset"):
+        for cell in family_grid(task, (family,))[0]:
+            (plain, plain_deviations), (shift, shift_deviations) = (
+                measured(task.replace(onset=onset), cell.contact, points, position) for onset in ("none", "shift")
+            )
+            off = (percent(abs(each.first[0] / each.slope[0] - 1), 3) for each in (plain, shift))
+            deviations = *plain_deviations[0], shift_deviations[0][1]
+            slope = f"{plain.slope[0]:.5f} ± {plain.slope_error[0]:.1g}"
+            rows.append((f"`{family}`", f"{cell.stiffness:g}", slope, *off, *(f"{each:.2g}" for each in deviations)))
+            print(rows[-1], flush=True)
+    names = "family", "K [N/m]", "slope", "E[FoBG] off by", "with shifts", "deviation: ZoBG", "FoBG", "with shifts"
+    write_tables(DOCS / "onset-correction.md", {"stiffness": markdown_table(rows, names)})
+
+
 def rule() -> None:
     """Print the error of the linear term as a share of what it adds, over the onset strength."""
     cases = []
@@ -126,24 +153,29 @@ def rule() -> None:
 def cost() -> None:
     """Write the ratios of gradients' times, and what the rollouts' events are, in processor time of one device."""
     tasks = {f"`{name}`": (make_task(name), SAMPLES_AT_ONCE) for name in TIMED} | {"quadruped": (walk(128), 16)}
-    ratios, events = [], []
+    columns = []
     for task, samples in tasks.values():
         own = task.contact_pair is None
         contact = None if own else family_model("mujoco_default", task.scene, effective_mass=task.effective_mass)
-        objective = Simulator(task, samples).objective(contact)
         keys = jax.random.split(jax.random.key(0), samples)
-        calls = {
-            "plain": lambda objective=objective, task=task, keys=keys: objective.differentiate(task.theta, keys),
-            "term": lambda objective=objective, task=task, keys=keys: objective.differentiate_corrected(
-                task.theta, keys
-            ),
+        plain, *corrected = (Simulator(task.replace(onset=each), samples).objective(contact) for each in TREATMENTS)
+        calls = {"none": partial(plain.differentiate, task.theta, keys)}
+        calls |= {
+            name: partial(each.differentiate_corrected, task.theta, keys)
+            for name, each in zip(TREATMENTS[1:], corrected, strict=True)
         }
         found, _, missed, *_ = np.asarray([call() for call in calls.values()][1].events).T
-        taken = interleaved(calls, 301, clock=time.process_time, limit=15)
-        ratios.append(f"{np.median(taken['term']) / np.median(taken['plain']):.2f}")
-        events.append(f"{np.mean(found):.1f}, {np.max(found):.0f}, {np.mean(missed):.1f}")
-        print(ratios, events, flush=True)
-    rows = ("time with the term over time without", *ratios), ("onsets: mean, most, without a term", *events)
+        taken = {
+            name: np.median(each) for name, each in interleaved(calls, 301, clock=time.process_time, limit=15).items()
+        }
+        ratios = [f"{taken[name] / taken['none']:.2f}" for name in TREATMENTS[1:]]
+        columns.append((*ratios, f"{np.mean(found):.1f}, {np.max(found):.0f}, {np.mean(missed):.1f}"))
+        print(columns[-1], flush=True)
+    names = (
+        *(f"time with the term ({name}) over time without" for name in TREATMENTS[1:]),
+        "onsets: mean, most, without",
+    )
+    rows = [(name, *each) for name, each in zip(names, zip(*columns, strict=True), strict=True)]
     write_tables(DOCS / "onset-correction.md", {"cost": markdown_table(rows, ("", *tasks))})
 
 
@@ -151,7 +183,7 @@ def main() -> None:
     """Run the command line."""
     configure(cpu_devices=1)
     if chosen := sys.argv[1:]:
-        {"tennis": tennis, "rule": rule, "cost": cost}[chosen[0]]()
+        {"tennis": tennis, "rule": rule, "stiffness": stiffness, "cost": cost}[chosen[0]]()
         return
     for name, angles in ANGLES.items():
         found = {onset: measure(make_task(name).replace(onset=onset), angles) for onset in TREATMENTS}
@@ -162,14 +194,14 @@ def main() -> None:
             _print(onset, _with_errors(each.first, each.first_error))
         _print("deviation: ZoBG", [f"{zeroth:.3g}" for zeroth, _ in deviations])
         each = [[own[index][1] for _, own in found.values()] for index in range(len(angles))]
-        _print("FoBG, linear, jump", [", ".join(f"{value:.2g}" for value in row) for row in each])
-        for onset in ("linear", "jump"):
+        _print("FoBG, linear, shift", [", ".join(f"{value:.2g}" for value in row) for row in each])
+        for onset in ("linear", "shift"):
             ratios = [(zeroth / own[1]) ** 2 for (zeroth, _), own in zip(deviations, found[onset][1], strict=True)]
             _print(f"variance of ZoBG over {onset}", [f"{ratio:.2g}" for ratio in ratios])
     _print("`momentum_transfer`, h", [f"{angle} rad" for angle in ANGLES["momentum_transfer"]])
     for timestep in TIMESTEPS:
         task = task_of("momentum_transfer", timestep)
-        for onset in ("linear", "jump"):
+        for onset in ("linear", "shift"):
             each, _ = measure(task.replace(onset=onset), ANGLES["momentum_transfer"])
             _print(f"{onset}, {1e3 * timestep:g} ms", [percent(error, 2) for error in abs(each.first / each.slope - 1)])
 

@@ -76,14 +76,14 @@ def _means(samples: Any) -> np.ndarray:
 def main() -> None:
     """Write the table."""
     configure(cpu_devices=1)
-    found = {"slope": slopes()} | {onset: mean_gradients(onset) for onset in ("none", "linear", "jump")}
+    found = {"slope": slopes()} | {onset: mean_gradients(onset) for onset in ("none", "linear", "shift")}
     rows = []
     for name in REACHES:
         every = [means[name] for means in found.values()]
         (slope, _), *terms = every[0], every[2][0], every[3][0]
         cells = [f"{fine:.4f} ± {abs(fine - coarse):.1g}" for fine, coarse in every]
         rows.append([name, *cells, ", ".join(percent(abs(each / slope - 1), 2) for each in terms)])
-    header = ("parameter", "slope", "E[FoBG]", "linear", "jump", "linear, jump: off by")
+    header = ("parameter", "slope", "E[FoBG]", "linear", "shift", "linear, shift: off by")
     write_tables(DOCS / "onset-correction.md", {"model": markdown_table(rows, header)})
 
 

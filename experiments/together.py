@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from estimators import NOISES
 from experiments import DATA, DOCS, read_lines
 from experiments.pages import write_tables
 from experiments.starts import task_of_start
@@ -29,7 +30,7 @@ from mjx_study.tasks.task import Task
 
 RESULTS: Final = DATA / "together.jsonl"
 POINTS: Final = 1600
-TREATMENTS: Final = ("none", "linear", "jump")
+TREATMENTS: Final = ("none", "linear", "shift")
 FLOOR: Final = '<geom name="floor" type="plane" size="5 5 .1" friction=".6"/>'
 SLIDES: Final = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
 HINGE: Final = '<joint type="hinge" axis="0 1 0"/>'
@@ -154,15 +155,18 @@ def task_for(case: Case, milliseconds: float) -> Task:
 
 
 def measured(case: Case, milliseconds: float) -> dict[str, Any]:
-    """Return the slope of the mean cost, the means of first-order gradients, and the quadrature's errors."""
+    """Return the slope of the mean cost, the means of first-order gradients, with the quadrature's errors, and their
+    deviations."""
     task = task_for(case, milliseconds)
     points, found = grid(case.at, case.at, case.sigma, case.points, task.noise), {}
     for onset in TREATMENTS:
         values, slopes = Line(task.replace(onset=onset))(points, None)
         each = means(points, values, slopes, np.array([case.at]), case.sigma, task.noise)
-        found[onset] = float(each.first[0]), float(each.first_error[0])
+        weights = NOISES[task.noise].density((points - case.at) / case.sigma)
+        deviation = np.average((slopes - each.first) ** 2, weights=weights) ** 0.5
+        found[onset] = float(each.first[0]), float(each.first_error[0]), float(deviation)
         found["slope"] = float(each.slope[0]), float(each.slope_error[0])
-    return {name: [float(f"{value:.6g}") for value in pair] for name, pair in found.items()}
+    return {name: [float(f"{value:.6g}") for value in values] for name, values in found.items()}
 
 
 def touches(distances: np.ndarray) -> np.ndarray:
@@ -213,8 +217,10 @@ def page(results: dict[str, dict[str, Any]]) -> None:
         errors = ((abs(each[onset][0] / slope - 1), (each[onset][1] + unsure) / abs(slope)) for onset in TREATMENTS)
         off = [" ± ".join(percent(part, 1) for part in pair) for pair in errors]
         what, timestep = name.rsplit(", ", 1)
-        rows.append((what, timestep, f"{slope:.4g} ± {unsure:.1g}", *off))
-    header = "case", "timestep", "slope", *(f"off by: {name}" for name in ("plain", "linear", "jump"))
+        deviations = ", ".join(f"{each[onset][2]:.2g}" for onset in TREATMENTS)
+        rows.append((what, timestep, f"{slope:.4g} ± {unsure:.1g}", *off, deviations))
+    kinds = "plain", "linear", "shift"
+    header = "case", "timestep", "slope", *(f"off by: {name}" for name in kinds), f"deviation: {', '.join(kinds)}"
     write_tables(DOCS / "onset-correction.md", {"together": markdown_table(rows, header)})
 
 

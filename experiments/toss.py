@@ -68,23 +68,23 @@ def tossed(geom: str, onset: str) -> study.Task:
 def main() -> None:
     """Print the table."""
     jax.config.update("jax_enable_x64", True)
-    print(markdown_table([], ("scene", "slope", "E[FoBG]", "with the linear term")))
+    print(markdown_table([], ("scene", "slope", "E[FoBG]", "with the linear term", "with shifts")))
     points = grid(START, START, SPREAD, 4000, "gaussian")
     for pulls, timestep in itertools.product((True, False), (0.1, 0.001)):
         found = means(points, *point(points, timestep, pulls=pulls), np.array([START]), SPREAD, "gaussian")
         what = "as published" if pulls else "without its pull"
         numbers = (_with_error(found.slope, found.slope_error), _with_error(found.first, found.first_error))
-        print(markdown_row(f"point, {what}, h = {1e3 * timestep:g} ms", *numbers, ""))
+        print(markdown_row(f"point, {what}, h = {1e3 * timestep:g} ms", *numbers, "", ""))
     points = grid(SPEED, SPEED, SIGMA, POINTS, "gaussian")
     for geom in GEOMS:
-        lines = [Line(tossed(geom, onset)) for onset in ("none", "linear")]
+        lines = [Line(tossed(geom, onset)) for onset in ("none", "linear", "shift")]
         for name, solimp in SOLIMP.items():
             contact = ContactModel(jnp.array(SOLREF), jnp.array(solimp))
-            plain, corrected = (
+            plain, *corrected = (
                 means(points, *line(points, contact), np.array([SPEED]), SIGMA, "gaussian") for line in lines
             )
             numbers = [_with_error(plain.slope, plain.slope_error), _with_error(plain.first, plain.first_error)]
-            numbers.append(_with_error(corrected.first, corrected.first_error))
+            numbers += [_with_error(each.first, each.first_error) for each in corrected]
             print(markdown_row(f"{geom}, solimp[0] = {name}", *numbers), flush=True)
 
 

@@ -14,7 +14,7 @@ PRECISIONS: Final = ("float64", "float32")
 CONES: Final = ("pyramidal", "elliptic")
 SOLVERS: Final = ("newton", "cg")
 INTEGRATORS: Final = ("euler", "implicitfast", "rk4")
-ONSETS: Final = ("none", "linear", "jump")
+ONSETS: Final = ("none", "linear", "shift")
 """Treatment of the onset of contact in first-order gradients."""
 KINDS: Final = {
     "gradients": "mjx_study.experiment.gradients",

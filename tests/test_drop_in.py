@@ -365,7 +365,7 @@ def test_the_onset_term_is_of_first_order() -> None:
         step(model, data, onset="smooth")
     with pytest.raises(ValueError, match="unknown onset of a step 'smooth'"), differentiable_mjx(onset="smooth"):
         pass
-    with pytest.raises(ValueError, match="unknown onset 'exact'; choose from none, linear, jump"):
+    with pytest.raises(ValueError, match="unknown onset 'exact'; choose from none, linear, shift"):
         check_onset("exact")
     with pytest.raises(TypeError, match="of first order: it has no second derivative"):
         jax.hessian(lambda mass: step(model.replace(body_mass=mass), data, onset="linear").qpos[0])(model.body_mass)

@@ -268,6 +268,6 @@ def test_forces_and_onsets_of_mujocos_law_are_refused() -> None:
         seen.contact_force("pusher", "slider")
     assert seen.xpos.shape == (task.scene.host.nbody, 3)  # what moves has no law
     noise = jnp.zeros(task.policy.noise_shape)
-    for onset in ("linear", "jump"):
+    for onset in ("linear", "shift"):
         with pytest.raises(ValueError, match="the onset term is that of MuJoCo's law"):
             rollout_cost(task, task.theta, contact, study.initial_state(task.scene), noise, onset)

@@ -10,34 +10,35 @@ import pytest
 
 from experiments.over_model import mean_gradients, slopes
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import initial_state, rollout
-from mjx_study.simulation.onset import corrected_rollout
+from mjx_study.simulation.onset import corrected, corrected_rollout
 from mjx_study.simulation.scene import Scene
+from mjx_study.simulation.shift import shifted
 from tests.scenes import FALLING, compiled, floor_scene, option, scene_of, slider
 from tests.test_onset_term import BOUNCING, LAW, Law
 
-ONSETS = {"step": "linear", "linear": "linear", "jump": "jump"}
-NONE = lambda state, control: jnp.zeros(())  # noqa: E731
+ONSETS = {"step": "linear", "linear": "linear", "shift": "shift"}
+SIMULATED = {"linear": corrected, "shift": shifted}
 
 
 def last_state(path: str, onset: str, scene: Scene, model: mjx.Model, start: Any, steps: int) -> Any:
-    """Last position and velocity, by the drop-in step or by rollouts; the jump's term is that of the position."""
+    """Last position and velocity, by the drop-in step or by rollouts."""
     if path == "step":
         data = scene.template.replace(qpos=start.qpos, qvel=start.qvel)
         last = jax.lax.scan(lambda data, _: (step(model, data, onset=onset), None), data, length=steps)[0]
         return last.qpos, last.qvel
-    linear = onset == "linear"
-    states, controls, *_ = (corrected_rollout if linear else rollout)(scene, model, start, LAW, steps)
-    extra = jnp.zeros(())
-    if onset == "jump":
-        extra, _ = jump_term(scene, model, states, controls, LAW, NONE, lambda state: state.qpos[0])
-    return states.qpos[-1] + extra, states.qvel[-1]
+    if onset == "none":
+        states, *_ = rollout(scene, model, start, LAW, steps)
+    else:
+        states, *_ = corrected_rollout(scene, model, start, LAW, steps, simulate=SIMULATED[onset])
+    return states.qpos[-1], states.qvel[-1]
 
 
-@pytest.mark.parametrize("path", ["linear", *(pytest.param(path, marks=pytest.mark.slow) for path in ("step", "jump"))])
+@pytest.mark.parametrize(
+    "path", ["linear", *(pytest.param(path, marks=pytest.mark.slow) for path in ("step", "shift"))]
+)
 @pytest.mark.parametrize(
     ("law", "speed", "gap", "steps"),
     [(Law(), -1.5, 0.0352, 80), pytest.param(BOUNCING, -1.0, 0.0349, 400, marks=pytest.mark.slow)],
@@ -110,7 +111,7 @@ def test_rollouts_have_the_derivatives_of_the_drop_in_step() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("onset", ["linear", "jump"])
+@pytest.mark.parametrize("onset", ["linear", "shift"])
 def test_the_mean_has_the_slope_over_the_model(onset: str) -> None:
     """Within 3 %, on `momentum_transfer`; where the model moves the touch, plain first order is 460 % off or more."""
     expected, plain, corrected = slopes(), mean_gradients("none"), mean_gradients(onset)

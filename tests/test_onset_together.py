@@ -5,6 +5,7 @@ with the same damping b and stiffness k d.
 """
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +16,11 @@ from mjx_study import InitialStatePolicy, Task
 from mjx_study.experiment.quadrature import grid, means
 from mjx_study.objective.cost import rollout_cost
 from mjx_study.simulation import constraint, guards, touch
-from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import advance_velocity, force_stage, initial_state, position_stage, rollout
 from mjx_study.simulation.onset import corrected_rollout, passages
+from mjx_study.simulation.shift import shifted
 from mjx_study.simulation.touch import Crossings, Events, replaced_points
 from tests.scenes import floor_scene, option, run, scene_of
 from tests.test_onset_term import LAW
@@ -39,20 +40,15 @@ def contact(damping: float, stiffness: float, impedance: float) -> ContactModel:
 
 
 def falls(body: str, law: ContactModel, gaps: np.ndarray, by_steps: bool) -> np.ndarray:
-    """Last gap, and its derivative by the first with the linear term; the derivative of a cost with the jump."""
+    """Last gap, and its derivatives by the first with the linear term and with shifts in time."""
     scene = scene_of(floor_scene(body, option(2e-3, "", 'refsafe="disable"'), 'condim="1"'))
     model = apply_contact(scene.model, law)
-    cost = lambda state: 100 * (state.qpos[0] - 0.02) ** 2  # noqa: E731
     speed, steps = jnp.array([-1.0]), 60
 
-    def linear(gap):
-        states, *_, counts = corrected_rollout(scene, model, initial_state(scene, gap[None], speed), LAW, steps)
+    def last(gap, **options):
+        start = initial_state(scene, gap[None], speed)
+        states, *_, counts = corrected_rollout(scene, model, start, LAW, steps, **options)
         return states.qpos[-1, 0], counts.found
-
-    def jump(gap):
-        states, controls, _ = rollout(scene, model, initial_state(scene, gap[None], speed), LAW, steps)
-        term, counts = jump_term(scene, model, states, controls, LAW, lambda *_: jnp.zeros(()), cost)
-        return cost(jax.tree.map(lambda leaf: leaf[-1], states)) + term, counts.found
 
     def drop_in(gap):
         advance = lambda data, _: (step(model, data, onset="linear"), None)  # noqa: E731
@@ -62,9 +58,9 @@ def falls(body: str, law: ContactModel, gaps: np.ndarray, by_steps: bool) -> np.
     def sample(gap):
         if by_steps:
             return jnp.stack(jax.value_and_grad(drop_in)(gap)), None
-        (value, found), of_linear = jax.value_and_grad(linear, has_aux=True)(gap)
-        of_jump, also_found = jax.grad(jump, has_aux=True)(gap)
-        return jnp.stack([value, of_linear, of_jump]), jnp.stack([found, also_found])
+        (value, found), of_linear = jax.value_and_grad(last, has_aux=True)(gap)
+        of_shift, also_found = jax.grad(partial(last, simulate=shifted), has_aux=True)(gap)
+        return jnp.stack([value, of_linear, of_shift]), jnp.stack([found, also_found])
 
     values, found = run(jax.vmap(sample), gaps)
     assert found is None or np.all(found == (1 if body is BALL else CORNERS))
@@ -184,14 +180,15 @@ def slope_and_mean(hinge: str, onset: str, feet: str = "") -> tuple[float, float
 
 TILTED = '<joint type="hinge" axis="0 1 0"/>'
 FOOT = '<geom type="sphere" size=".001" mass=".001" pos="{} {} -.099" friction=".6"/>'
+LANDINGS = "flat", "tilted", "on feet"
 FEET = "".join(FOOT.format(x, y) for x in (-0.199, 0.199) for y in (-0.099, 0.099))
 
 
 @pytest.mark.parametrize(
     ("onset", "lands"),
     [
-        *(("linear", lands) for lands in ("flat", "tilted", "on feet")),
-        *(pytest.param("jump", lands, marks=pytest.mark.slow) for lands in ("flat", "on feet")),
+        *(("linear", lands) for lands in LANDINGS),
+        *(pytest.param("shift", lands, marks=pytest.mark.slow if "feet" in lands else ()) for lands in LANDINGS),
     ],
 )
 def test_a_box_that_lands_has_the_slope(onset: str, lands: str) -> None:

@@ -1,20 +1,25 @@
 """Figures of docs/: the tasks as MJX simulates them, their physics against closed forms, and the onset term.
 
     python -m experiments.figures             all of them
-    python -m experiments.figures physics     one of them: tasks, physics or onset-correction
+    python -m experiments.figures physics     one of them: tasks, physics, onset-correction or onset-stiffness
 
 It takes a minute or two, most of it to compile; compiled programs are kept between runs.
 """
 
 import argparse
 
-from experiments.figures.onset import correction_figure
+from experiments.figures.onset import correction_figure, stiffness_figure
 from experiments.figures.physics import physics_figure
 from experiments.figures.tasks import tasks_figure
 from experiments.pages import save_figure
 from mjx_study.runtime import configure
 
-FIGURES = {"tasks": tasks_figure, "physics": physics_figure, "onset-correction": correction_figure}
+FIGURES = {
+    "tasks": tasks_figure,
+    "physics": physics_figure,
+    "onset-correction": correction_figure,
+    "onset-stiffness": stiffness_figure,
+}
 
 
 def main() -> None:

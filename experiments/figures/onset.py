@@ -1,4 +1,4 @@
-"""docs/onset-correction.png: first-order gradients with and without the onset term."""
+"""docs/onset-correction.png and docs/onset-stiffness.png: first-order gradients with and without the onset term."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,7 +15,7 @@ def correction_figure() -> Figure:
     points = grid(position[0], position[-1], task.sigma, 2000, task.noise)
     found = {
         onset: means(points, *Line(task.replace(onset=onset))(points, contact), position, task.sigma, task.noise)
-        for onset in ("none", "linear", "jump")
+        for onset in ("none", "linear", "shift")
     }
     figure = Figure(figsize=(9.0, 3.6), dpi=DPI, layout="constrained")
     wide, near = figure.subplots(1, 2)
@@ -24,7 +24,7 @@ def correction_figure() -> Figure:
         for onset, colour, label in (
             ("none", ORANGE, "mean of FoBG"),
             ("linear", BLUE, "mean of FoBG with the linear onset term"),
-            ("jump", GREEN, "mean of FoBG with the jump"),
+            ("shift", GREEN, "mean of FoBG with shifts in time"),
         ):
             axes.plot(position, found[onset].first, color=colour, linewidth=1.5, label=label)
         axes.axhline(0.0, color=GREY, linewidth=0.8)
@@ -36,3 +36,37 @@ def correction_figure() -> Figure:
     wide.legend(frameon=False, fontsize=8.5)
     near.set_title("enlarged around the slope of the mean cost", fontsize=10)
     return figure
+
+
+def stiffness_figure() -> Figure:
+    """Draw deviations of one gradient against stiffness: zeroth order, first order, the same with shifts."""
+    task, angle, stiffness = task_of("momentum_transfer"), 0.5, np.geomspace(300, 1e5, 16)
+    points = grid(angle, angle, task.sigma, 2000, task.noise)
+    weights = np.exp(-(((points - angle) / task.sigma) ** 2) / 2)
+    figure = Figure(figsize=(9.0, 3.4), dpi=DPI, layout="constrained")
+    every = figure.subplots(1, 2, sharey=True)
+    for axes, family, title in zip(
+        every, ("penalty", "smooth_onset"), ("spring without damper", "MuJoCo, impedance from 0"), strict=True
+    ):
+        deviations = []
+        for each in stiffness:
+            contact = contact_of(task, family, each)
+            (values, plain), (_, shift) = (
+                Line(task.replace(onset=onset))(points, contact) for onset in ("none", "shift")
+            )
+            zeroth = (values - np.interp(angle, points, values)) * (points - angle) / task.sigma**2
+            deviations.append([_deviation(samples, weights) for samples in (zeroth, plain, shift)])
+        labels = ("zeroth order", BLUE), ("first order", ORANGE), ("first order with shifts in time", GREEN)
+        for (label, colour), each in zip(labels, np.array(deviations).T, strict=True):
+            axes.loglog(stiffness, each, color=colour, marker="o", markersize=3, linewidth=1.5, label=label)
+        axes.set_title(f"{title} (`{family}`)".replace("`", ""), fontsize=10)
+        axes.set_xlabel("contact stiffness [N/m]")
+        axes.grid(alpha=0.25)
+    every[0].set_ylabel("standard deviation of one gradient")
+    every[1].legend(frameon=False, fontsize=8.5)
+    return figure
+
+
+def _deviation(samples: np.ndarray, weights: np.ndarray) -> float:
+    mean = np.average(samples, weights=weights)
+    return float(np.average((samples - mean) ** 2, weights=weights) ** 0.5)

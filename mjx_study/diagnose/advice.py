@@ -160,6 +160,6 @@ def _onset(found: Diagnosis) -> Iterator[Advice]:
         step = round_down(timestep * NOTABLE_SHARE / linear)
         yield (
             f"{linear_error(strength)}: --timestep {step} brings that down to {percent(NOTABLE_SHARE)}; the "
-            "error of --onset jump is only of second order in the step",
-            "--onset jump",
+            "error of --onset shift does not depend on it",
+            "--onset shift",
         )

@@ -161,7 +161,7 @@ def reject_unread(chosen: Sequence[str | Estimator], given: Iterable[str]) -> No
         reject_unused([option], ([option], name in read, reason))
 
 
-def reads_onset(chosen: Iterable[str | Estimator], onset: str = "jump") -> bool:
+def reads_onset(chosen: Iterable[str | Estimator], onset: str = "shift") -> bool:
     """Whether an onset term changes any of the estimators; those named for it have the linear one anyway."""
     needed = {oracle for each in map(find_estimator, chosen) for oracle in each.needs if ORACLES[oracle].order}
     return bool(needed - {CORRECTED} if onset == "linear" else needed)

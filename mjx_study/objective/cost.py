@@ -1,19 +1,16 @@
 """The cost of one rollout as a pure function, for tracing and differentiation."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Float, Key
 
 from estimators.noise import split_sample_key, standard_noise
 from mjx_study.graph.random import normal
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
 from mjx_study.simulation.dynamics import State, simulated, trajectory
-from mjx_study.simulation.onset import corrected, without_derivative
+from mjx_study.simulation.onset import corrected
+from mjx_study.simulation.shift import shifted
 from mjx_study.simulation.touch import OnsetCounts
 from mjx_study.tasks.task import Task
 
@@ -32,9 +29,9 @@ def rollout_cost(
     Args:
         contact: None for the MJCF's own.
         start: the initial state, before the policy acts on it.
-        onset: "none", or "linear" or "jump" for a derivative with the onset term (see `mjx_study.simulation.onset` and
-            `mjx_study.simulation.branches`).
-        weight: factor of the linear onset term; 0 for a derivative without it.
+        onset: "none", or "linear" or "shift" for a derivative with the onset term (see `mjx_study.simulation.onset` and
+            `mjx_study.simulation.shift`).
+        weight: factor of the onset term; 0 for a derivative without it.
 
     Returns:
         The cost; and the states `(horizon + 1, ...)` including the initial one, the controls, the largest relative
@@ -42,7 +39,7 @@ def rollout_cost(
     """
     feedforward = task.policy.feedforward(theta, noise)
 
-    def control_law(feedforward, state, theta=theta):
+    def control_law(feedforward, state):
         feedback = task.policy.feedback(theta, state)
         return feedforward if feedback is None else feedforward + feedback
 
@@ -54,27 +51,14 @@ def rollout_cost(
         raise ValueError("the onset term is that of MuJoCo's law: omit onset, or the contact's law")
     running_cost, final_cost = task.costs(contact)
     first = task.policy.place(theta, noise, start)
-    moved, counts, term = (task.scene, model, first, control_law), None, 0.0
-    if onset == "linear":
-        last, found, counts = corrected(*moved, feedforward, running_cost, weight=weight)
+    moved, counts = (task.scene, model, first, control_law, feedforward, running_cost), None
+    if onset == "none":
+        last, found = simulated(*moved, backward)
     else:
-        last, found = simulated(*moved, feedforward, running_cost, backward)
+        last, found, counts = {"linear": corrected, "shift": shifted}[onset](*moved, weight=weight)
     before, controls, residuals, costs = found
-    states = trajectory(before, last)
-    if onset == "jump":
-        fixed, each = jax.lax.stop_gradient((theta, feedforward))
-        law = lambda index, state: control_law(each[index], state, fixed)  # noqa: E731
-        costs_to_go = _with_fixed_model(task).costs(without_derivative(contact))
-        term, counts = jump_term(task.scene, model, states, controls, law, *costs_to_go)
     cost = jnp.sum(costs) + final_cost(last)
-    return cost + term, (states, controls, jnp.max(residuals), counts)
-
-
-def _with_fixed_model(task: Task) -> Task:
-    """The task, its scene without derivatives over the model."""
-    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(task.scene.model)):
-        return task
-    return task.replace(scene=dataclasses.replace(task.scene, model=without_derivative(task.scene.model)))
+    return cost, (trajectory(before, last), controls, jnp.max(residuals), counts)
 
 
 def derivative_model(task: Task, contact: ContactModel | None) -> mjx.Model | None:

@@ -195,9 +195,7 @@ class StudyConfig:
     window: int | None = of_estimators("window")
     tolerance: float = of_estimators("tolerance")
     weights: str = of_estimators("weights")
-    onset: str = declared(
-        "none", "NAME", "onset term of first-order gradients: none, linear, or jump (costly)", choices=ONSETS
-    )
+    onset: str = declared("none", "NAME", "onset term of first-order gradients: none, linear, or shift", choices=ONSETS)
     backward: tuple[str, ...] = declared(
         ("none",), "FAMILY", "contact whose derivatives are taken", choices=("none", *FAMILIES)
     )

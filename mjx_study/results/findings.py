@@ -209,7 +209,7 @@ def _onset_findings(rows: Sequence[Row]) -> list[str]:
         most = max(row.onset_strength for row in strong)
         found.append(
             f"{linear_error(most)}{_at(strong)} (more at grazing contacts and corners): an onset takes {percent(most)} "
-            "of the approach speed in one step; --onset jump or a smaller timestep is better"
+            "of the approach speed in one step; --onset shift or a smaller timestep is better"
         )
     return found
 

@@ -98,12 +98,12 @@ def corrected_rollout(
     start: State,
     control_law: ControlLaw,
     horizon: int,
-    slots: int | None = None,
-    weight: float | Scalar = 1.0,
+    simulate: Callable[..., Any] | None = None,
+    **options: Any,
 ) -> tuple[State, Controls, Float[Array, " horizon"], OnsetCounts]:
-    """`dynamics.rollout` with the same values, but derivatives that include the onset term; see `corrected`."""
+    """`dynamics.rollout` with the same values, but derivatives that include the onset term, of `corrected` or alike."""
     law = control_law, jnp.arange(horizon)
-    last, found, counts = corrected(scene, model, start, *law, lambda *_: None, slots, weight)
+    last, found, counts = (simulate or corrected)(scene, model, start, *law, lambda *_: None, **options)
     states, controls, residuals, _ = found
     return trajectory(states, last), controls, residuals, counts
 
@@ -132,22 +132,8 @@ def corrected(
         return *found, OnsetCounts.none(start.qpos.dtype)
     fixed_model, timestep = without_derivative(model), timestep_of(scene, model)
     slots = slots_for(scene, len(jax.tree.leaves(inputs)[0])) if slots is None else slots
-
-    def observe(carry: tuple[State, Past], given: Any):
-        state, past = carry
-        control, cost = jax.lax.stop_gradient(acted(given, state))
-        following, residual, past, found = with_solver(partial(_observed, scene), fixed_model, state, control, past)
-        return (following, past), (state, control, following, residual, cost, found)
-
-    def acted(given: Any, state: State):
-        control = control_law(given, state)
-        return control, running_cost(state, control)
-
-    begin = jax.lax.stop_gradient(start)
-    step = partial(observed_step, scene, constraint.run_solver, fixed_model)
-    course = lambda given: step(begin, control_law(given, begin))[2]  # noqa: E731
-    like = jax.eval_shape(course, jax.tree.map(lambda leaf: leaf[0], inputs))
-    (last, past), known = jax.lax.scan(observe, (begin, Past.none(like)), inputs)
+    acted = acting(control_law, running_cost)
+    last, past, known = observed_rollout(scene, fixed_model, start, acted, inputs)
     before, controls, after, residuals, costs, found = known
     terms, events, counts = _corrections(scene, fixed_model, before, controls, after, found, past, slots)
     spread, shift, slope = jax.lax.stop_gradient((weight * terms.spread, weight * terms.shift, terms.slope))
@@ -156,13 +142,13 @@ def corrected(
 
     def follow(state: State, known):
         given, fixed, values, after, own, (earlier, later) = known
-        state = _moving(fixed, state)
-        control, cost = _moving(values, acted(given, state))
+        state = moving_values(fixed, state)
+        control, cost = moving_values(values, acted(given, state))
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
         velocity = tangent_of(along_events(shift, slope, own, moved - timestep * state.qvel) + earlier)
         shifted = integrate_position(scene.host, state.qpos, velocity, timestep), state.qvel + velocity
-        qpos, qvel = _moving((fixed.qpos, fixed.qvel), shifted)
-        qvel, act = _known_step(scene, model, (qpos, qvel, state.act, control), after)
+        qpos, qvel = moving_values((fixed.qpos, fixed.qvel), shifted)
+        qvel, act = known_step(scene, model, (qpos, qvel, state.act, control), after)
         qvel = qvel + tangent_of(along_events(spread, slope, own, moved) + later)
         following = State(integrate_position(scene.host, qpos, qvel, timestep), qvel, act, after.warmstart)
         return following, (state, control, cost)
@@ -170,7 +156,47 @@ def corrected(
     own = jnp.minimum(found.before, slots), jnp.minimum(found.after, slots)
     known = inputs, before, (controls, costs), after, own, over_model
     moving, (states, controls, costs) = jax.lax.scan(follow, start, known)
-    return _moving(last, moving), (states, controls, residuals, costs), counts
+    return moving_values(last, moving), (states, controls, residuals, costs), counts
+
+
+Acted = Callable[[Any, State], tuple[Control, Any]]
+"""The control of a step and its cost, from its input and the state before it."""
+
+
+def acting(control_law: ControlLaw, running_cost: RunningCost) -> Acted:
+    """Return the two of a rollout as one function."""
+
+    def acted(given: Any, state: State) -> tuple[Control, Any]:
+        control = control_law(given, state)
+        return control, running_cost(state, control)
+
+    return acted
+
+
+def observed_rollout(scene: Scene, model: mjx.Model, start: State, acted: Acted, inputs: Any) -> tuple[Any, ...]:
+    """A rollout without derivatives.
+
+    Args:
+        model: the model to step, without derivatives.
+        inputs: of every step.
+
+    Returns:
+        The state after it, what its guards did, and of every step the state before it, its control, the state after it,
+        its residual and cost, and its `Changes`.
+    """
+
+    def observe(carry: tuple[State, Past], given: Any):
+        state, past = carry
+        control, cost = jax.lax.stop_gradient(acted(given, state))
+        following, residual, past, found = with_solver(partial(_observed, scene), model, state, control, past)
+        return (following, past), (state, control, following, residual, cost, found)
+
+    begin = jax.lax.stop_gradient(start)
+    step = partial(observed_step, scene, constraint.run_solver, model)
+    course = lambda given: step(begin, acted(given, begin)[0])[2]  # noqa: E731
+    like = jax.eval_shape(course, jax.tree.map(lambda leaf: leaf[0], inputs))
+    (last, past), known = jax.lax.scan(observe, (begin, Past.none(like)), inputs)
+    return last, past, known
 
 
 def timestep_of(scene: Scene, model: mjx.Model) -> float | Scalar:
@@ -188,12 +214,12 @@ def _observed(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: 
     return after, residual, *changes(course, past, timestep_of(scene, model))
 
 
-def _moving(known: Any, moving: Any) -> Any:
+def moving_values(known: Any, moving: Any) -> Any:
     """Known values, with the derivatives of others."""
     return jax.tree.map(_with_tangent, known, moving)
 
 
-def _known_step(scene: Scene, model: mjx.Model, point: Point, after: State) -> tuple[Qvel, Act]:
+def known_step(scene: Scene, model: mjx.Model, point: Point, after: State) -> tuple[Qvel, Act]:
     """Velocity and activations after a step, which are known, with their derivatives over what precedes it."""
     traced, whole = traced_part(model)
 
@@ -246,8 +272,18 @@ def _corrections(
             return in_parts(*given)
         return unrolled(partial(onset_term, with_newton), *given, otherwise=in_parts)
 
+    terms, strength, narrow, valid, rate = over_events(term, events)
+    chatters = events.chattering(rate, timestep_of(scene, model))
+    spread, shift = (jnp.where(chatters[:, None], 0.0, part) for part in (terms.spread, terms.shift))
+    terms = terms._replace(spread=spread, shift=shift)
+    return terms, events, events.counts(past, valid, narrow, strength, chatters)
+
+
+def over_events(function: Callable[[Events], Any], events: Events) -> Any:
+    """A function of every event, zeros for those slots that no sample of a batch uses."""
+
     def fill(_: None, some: Events):
-        """Terms of a few events; a loop, which ends at once where no sample has any.
+        """Of a few events; a loop, which ends at once where no sample has any.
 
         It carries the events, and clears them, since what depends on nothing that changes is computed before it.
         """
@@ -255,16 +291,11 @@ def _corrections(
         once = lambda carry: (jnp.zeros((), bool), jax.tree.map(jnp.zeros_like, carry[1]), every(carry[1]))  # noqa: E731
         return None, jax.lax.while_loop(lambda carry: carry[0], once, (jnp.any(some.used), some, none))[2]
 
-    every, few = (term, ()) if jax.default_backend() == "cpu" else (jax.vmap(term), (TOGETHER,))
+    every, few = (function, ()) if jax.default_backend() == "cpu" else (jax.vmap(function), (TOGETHER,))
     slots = len(events.used)
     grouped = jax.tree.map(lambda leaf: jnp.resize(leaf, (-(-slots // math.prod(few)), *few, *leaf.shape[1:])), events)
     _, each = jax.lax.scan(fill, None, grouped)
-    flat = lambda leaf: leaf.reshape(-1, *leaf.shape[1 + len(few) :])[:slots]  # noqa: E731
-    terms, strength, narrow, valid, rate = jax.tree.map(flat, each)
-    chatters = events.chattering(rate, timestep_of(scene, model))
-    spread, shift = (jnp.where(chatters[:, None], 0.0, part) for part in (terms.spread, terms.shift))
-    terms = terms._replace(spread=spread, shift=shift)
-    return terms, events, events.counts(past, valid, narrow, strength, chatters)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[1 + len(few) :])[:slots], each)
 
 
 Call = Callable[..., Any]
@@ -303,7 +334,7 @@ def onset_term(
     before = *map(at_once, (states.qvel, states.act, controls)), jnp.broadcast_to(states.warmstart, (2, len(qvel)))
     found: Passages = call(passages, model, template, touch.qpos, qvel, *before, event)
     jump, normal = found.qvel[0] - found.qvel[1], found.normal
-    least = least_travel(model, found, event.ends)
+    least = least_travel(model, found.qacc @ normal, event.ends | found.deep, found.rate)
     cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
     last, earlier = touch.weights
     slope = normal
@@ -408,16 +439,16 @@ def passages(
     return Passages(qvel, act, qacc, guard.normal, rate, spring, guard.deep)
 
 
-def least_travel(model: mjx.Model, found: Passages, ends: Bool[Array, ""]) -> Scalar:
+def least_travel(model: mjx.Model, across: Float[Array, " 2"], either: Bool[Array, ""], rate: Scalar) -> Scalar:
     """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
 
     Args:
-        found: steps with the contact and without.
-        ends: whether it ends.
+        across: acceleration of the guard with the contact and without [m/s^2 or rad/s^2].
+        either: whether both count, as where contact ends or begins in penetration, or that without alone.
+        rate: the larger of `guards.relaxation_rates`.
     """
-    on, off = jnp.abs(found.qacc @ found.normal)
-    fastest = jnp.where(ends | found.deep, jnp.maximum(on, off), off)
-    return model.opt.timestep * fastest / found.rate
+    on, off = jnp.abs(across)
+    return model.opt.timestep * jnp.where(either, jnp.maximum(on, off), off) / rate
 
 
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -1,0 +1,225 @@
+r"""The onset term by shifts in time: `--onset shift`.
+
+A rollout in which contact begins a step later is the rollout itself, a step late, as long as nothing but its state
+moves it. So its own states tell what a shift of an event changes, to all orders in the contact's damping and however
+many events follow: with z_k = (x_{k+1} - x_{k-1})/2, the derivative dx_k is split into a shift by a steps and the rest,
+
+    dx_{k+1} = A_k (dx_k - a z_k) + B_k (du_k - a w_k) + a z_{k+1},     w_k = (u_{k+1} - u_{k-1})/2,
+
+where A and B are the step's own derivatives. Where no event is near, that is A_k dx_k + B_k du_k up to curvature, and a
+makes no difference. Before step k - 1, if contact begins or ends at step k, the rest of the derivative is made one that
+leaves the time of touch as it is:
+
+    a <- a + n^T (dq - a z^q + (1 - s) h (dv - a z^v)) / D,     D = n^T (z^q + (1 - s) h z^v),
+
+with n the derivative of the guard's distance and s the share of a step since the touch. For touches spread evenly over
+a cell, the mean of the derivative of the cost along a shift is the difference of the cost over a whole step, which this
+computes; that half of each difference looks ahead and half behind makes the error one of second order in the step over
+the spread. Since a whole step's shift is mapped to a whole step's shift whatever s, events at fixed intervals, whose s
+are not spread, are right, too, and the variance over s vanishes.
+
+Events of one step share a equally. A cell narrower than in `onset.least_travel` counts as that wide: only what a lacks
+is then taken too small. Bodies on several feet, each with noise of its own, have one a: there the term of
+`mjx_study.simulation.onset` has less variance.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mjx_study.simulation import guards
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.constraint import Qvel, Scalar
+from mjx_study.simulation.dynamics import (
+    ControlLaw,
+    Controls,
+    Qpos,
+    RunningCost,
+    State,
+    entry_by_entry,
+    fwd_position,
+    simulated,
+)
+from mjx_study.simulation.integration import difference_position, integrate_position
+from mjx_study.simulation.onset import (
+    acting,
+    guard_at,
+    known_step,
+    least_travel,
+    moving_values,
+    observed_rollout,
+    over_events,
+    slots_for,
+    tangent_of,
+    timestep_of,
+    without_derivative,
+)
+from mjx_study.simulation.over_model import moved_by_model
+from mjx_study.simulation.scene import Scene
+from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, events_of
+
+
+def shifted(
+    scene: Scene,
+    model: mjx.Model,
+    start: State,
+    control_law: ControlLaw,
+    inputs: Any,
+    running_cost: RunningCost,
+    slots: int | None = None,
+    weight: float | Scalar = 1.0,
+) -> tuple[State, tuple[State, Controls, Float[Array, " horizon"], Any], OnsetCounts]:
+    """`dynamics.simulated` with the same values, but derivatives that include the onset term by shifts in time.
+
+    Arguments, results and derivatives are those of `onset.corrected`.
+    """
+    if not guards.num_guards(scene.template):
+        found = simulated(scene, model, start, control_law, inputs, running_cost)
+        return *found, OnsetCounts.none(start.qpos.dtype)
+    fixed_model, timestep = without_derivative(model), timestep_of(scene, model)
+    step_length, acted = timestep_of(scene, fixed_model), acting(control_law, running_cost)
+    last, past, known = observed_rollout(scene, fixed_model, start, acted, inputs)
+    before, controls, after, residuals, costs, found = known
+    events = events_of(found, slots_for(scene, len(controls)) if slots is None else slots)
+    ahead, behind = _halves(step_length, before, last, controls)
+    crossings = over_events(partial(_crossing_of, scene, fixed_model, before, after), events)
+    cells = _cells(crossings, events, ahead, behind, step_length)
+    at, steps = events.step - 1, jnp.zeros(len(controls), cells.rate.dtype)
+    over = cells.rate[:, None] * crossings.normal
+    updates = Update(
+        1 - steps.at[at].add(cells.rate * cells.travel),
+        jnp.zeros_like(before.qvel).at[at].add(over),
+        jnp.zeros_like(before.qvel).at[at].add((1 - cells.since)[:, None] * over),
+        steps.at[at].add(cells.rate * moved_by_model(scene, model, before, events)),
+    )
+
+    def follow(carry: tuple[State, Scalar], known: Any):
+        state, earlier = carry
+        given, fixed, values, after, update, ahead, behind = known
+        state = moving_values(fixed, state)
+        control, cost = moving_values(values, acted(given, state))
+        moved = difference_position(scene.host, fixed.qpos, state.qpos)
+        change = tangent_of(jnp.sum(update.qpos * moved) + jnp.sum(update.qvel * (timestep * state.qvel)))
+        shift = update.kept * earlier + change + update.by_model
+        own: Motion = jax.tree.map(lambda one, other: weight * (shift * one + earlier * other), ahead, behind)
+        rest = integrate_position(scene.host, state.qpos, -own.qpos, 1.0), state.qvel - own.qvel
+        point = *rest, state.act - own.act, control - own.control
+        point = moving_values((fixed.qpos, fixed.qvel, fixed.act, values[0]), point)
+        qvel, act = known_step(scene, model, point, after)
+        qvel, act = qvel + own.qvel_after, act + own.act_after
+        following = State(integrate_position(scene.host, state.qpos, qvel, timestep), qvel, act, after.warmstart)
+        return (following, shift), (state, control, cost)
+
+    known = inputs, before, (controls, costs), after, updates, ahead, behind
+    none = jnp.zeros((), cells.rate.dtype)
+    (moving, _), (states, controls, costs) = jax.lax.scan(follow, (start, none), known)
+    counts = events.counts(past, cells.valid, cells.narrow, jnp.zeros_like(cells.rate), jnp.zeros_like(cells.valid))
+    return moving_values(last, moving), (states, controls, residuals, costs), counts
+
+
+class Motion(NamedTuple):
+    """Half of what changes from one step to the next, for every step.
+
+    Attributes:
+        qpos, qvel, act, control: of the state before the step and its control; positions as a displacement.
+        qvel_after, act_after: of the state after it.
+    """
+
+    qpos: Float[Array, "steps nv"]
+    qvel: Float[Array, "steps nv"]
+    act: Float[Array, "steps na"]
+    control: Float[Array, "steps nu"]
+    qvel_after: Float[Array, "steps nv"]
+    act_after: Float[Array, "steps na"]
+
+
+def _halves(timestep: float | Scalar, before: State, last: State, controls: Controls) -> tuple[Motion, Motion]:
+    """From each step to the next, and to each step from the one before; zero where there is none."""
+    qvel, act = (jnp.concatenate([one, end[None]]) for one, end in ((before.qvel, last.qvel), (before.act, last.act)))
+    moved, sped, activated = timestep * qvel[1:] / 2, jnp.diff(qvel, axis=0) / 2, jnp.diff(act, axis=0) / 2
+    own = Motion(moved[:-1], sped[:-1], activated[:-1], jnp.diff(controls, axis=0) / 2, sped[1:], activated[1:])
+    ahead = jax.tree.map(lambda leaf: jnp.pad(leaf, ((0, 1), (0, 0))), own)
+    return ahead, jax.tree.map(lambda leaf: jnp.pad(leaf, ((1, 0), (0, 0))), own)
+
+
+class Crossing(NamedTuple):
+    """A guard that passes zero.
+
+    Attributes:
+        normal: derivative of its distance.
+        since: share of a step since then.
+        valid: whether it does by motion.
+        least: travel below which it grazes.
+    """
+
+    normal: Float[Array, "*slots nv"]
+    since: Float[Array, "*slots"]
+    valid: Bool[Array, "*slots"]
+    least: Float[Array, "*slots"]
+
+
+def _crossing_of(scene: Scene, model: mjx.Model, before: State, after: State, event: Events) -> Crossing:
+    qpos, qvel = before.qpos[event.step], before.qvel[event.step]
+    accelerations = jnp.stack([after.warmstart[event.step], after.warmstart[event.step - 1]])
+    return entry_by_entry(_crossing, model, scene.template, qpos, qvel, accelerations, event)
+
+
+def _crossing(
+    model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, accelerations: Float[Array, "2 nv"], event: Events
+) -> Crossing:
+    """An event's crossing, from the state before its step and the accelerations in it and in the one before."""
+    touch = at_touch(None, model, template, qpos, qvel, event)
+    positioned = fwd_position(model, template.replace(qpos=touch.qpos))
+    guard = guard_at(model, positioned, qvel, event)
+    rate = jnp.maximum(*guards.relaxation_rates(model, positioned.replace(qvel=qvel), guard.weights))
+    least = least_travel(model, accelerations @ guard.normal, event.ends | guard.deep, rate)
+    return Crossing(guard.normal, jnp.clip(touch.share, 0, 1), touch.valid, least)
+
+
+class Cells(NamedTuple):
+    """Widths of what events' touches are spread over.
+
+    Attributes:
+        travel: D.
+        rate: 1 / D, of the cell's width, divided by the number of events in the step; 0 if the event is not valid.
+        since: s.
+        valid, narrow: whether D has the event's sign, and whether the cell counts as wider.
+    """
+
+    travel: Float[Array, " slots"]
+    rate: Float[Array, " slots"]
+    since: Float[Array, " slots"]
+    valid: Bool[Array, " slots"]
+    narrow: Bool[Array, " slots"]
+
+
+def _cells(crossings: Crossing, events: Events, ahead: Motion, behind: Motion, timestep: float | Scalar) -> Cells:
+    at, sign = events.step - 1, jnp.where(events.ends, 1, -1)
+    moved, sped = (  # z before step k - 1, in which there is nothing behind the first
+        (one + other).at[0].multiply(2)[at] for one, other in ((ahead.qpos, behind.qpos), (ahead.qvel, behind.qvel))
+    )
+    path = moved + timestep * (1 - crossings.since)[:, None] * sped
+    travel = jnp.sum(crossings.normal * path, axis=-1)
+    valid = events.used & crossings.valid & (travel * sign > 0)
+    width = jnp.where(valid, sign * jnp.maximum(jnp.abs(travel), crossings.least), 1.0)
+    number = jnp.zeros(len(ahead.qpos), travel.dtype).at[at].add(valid)[at]
+    rate = jnp.where(valid, 1 / (jnp.maximum(number, 1) * width), 0.0)
+    return Cells(travel, rate, crossings.since, valid, valid & (jnp.abs(travel) < crossings.least))
+
+
+class Update(NamedTuple):
+    """How the shift changes before each step.
+
+    Attributes:
+        kept: factor of the shift before.
+        qpos, qvel: what multiplies the derivative of the position, and that of the velocity times the timestep.
+        by_model: zero, with the derivative over the model.
+    """
+
+    kept: Float[Array, " steps"]
+    qpos: Float[Array, "steps nv"]
+    qvel: Float[Array, "steps nv"]
+    by_model: Float[Array, " steps"]
