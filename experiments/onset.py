@@ -171,10 +171,8 @@ def cost() -> None:
         ratios = [f"{taken[name] / taken['none']:.2f}" for name in TREATMENTS[1:]]
         columns.append((*ratios, f"{np.mean(found):.1f}, {np.max(found):.0f}, {np.mean(missed):.1f}"))
         print(columns[-1], flush=True)
-    names = (
-        *(f"time with the term ({name}) over time without" for name in TREATMENTS[1:]),
-        "onsets: mean, most, without",
-    )
+    kinds = (f"time with {kind} over time without" for kind in ("the linear term", "shifts"))
+    names = *kinds, "onsets: mean, most, without a term"
     rows = [(name, *each) for name, each in zip(names, zip(*columns, strict=True), strict=True)]
     write_tables(DOCS / "onset-correction.md", {"cost": markdown_table(rows, ("", *tasks))})
 

@@ -466,11 +466,11 @@ differentiated_once = refusing("derivatives with the onset term are of first ord
 
 
 def along_events(
-    jumps: Float[Array, "slots nv"],
-    slopes: Float[Array, "slots nv"],
+    jumps: Float[Array, "slots after"],
+    slopes: Float[Array, "slots before"],
     own: tuple[Int[Array, ""], Int[Array, ""]],
-    moved: Float[Array, " nv"],
-) -> Float[Array, " nv"]:
+    moved: Float[Array, " before"],
+) -> Float[Array, " after"]:
     """Sum of some events' jumps times their slopes' products with a motion, linear in the latter.
 
     Args:
@@ -478,8 +478,9 @@ def along_events(
     """
 
     def total(jumps: Array, slopes: Array, first: Array, last: Array, moved: Array) -> list[Array]:
+        none = jnp.zeros(jumps.shape[1:], moved.dtype)
         add = lambda carry: (carry[0] + 1, carry[1] + jumps[carry[0]] * jnp.sum(slopes[carry[0]] * moved))  # noqa: E731
-        return [jax.lax.while_loop(lambda carry: carry[0] < last, add, (first, jnp.zeros_like(moved)))[1]]
+        return [jax.lax.while_loop(lambda carry: carry[0] < last, add, (first, none))[1]]
 
     def rule(primals: Sequence[Any], changes: Sequence[Any]) -> Any:
         return linear(*primals), linear(*primals[:-1], changes[-1])

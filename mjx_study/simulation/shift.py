@@ -46,6 +46,7 @@ from mjx_study.simulation.dynamics import (
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.onset import (
     acting,
+    along_events,
     guard_at,
     known_step,
     least_travel,
@@ -84,65 +85,72 @@ def shifted(
     last, past, known = observed_rollout(scene, fixed_model, start, acted, inputs)
     before, controls, after, residuals, costs, found = known
     events = events_of(found, slots_for(scene, len(controls)) if slots is None else slots)
-    ahead, behind = _halves(step_length, before, last, controls)
     crossings = over_events(partial(_crossing_of, scene, fixed_model, before, after), events)
-    cells = _cells(crossings, events, ahead, behind, step_length)
-    at, steps = events.step - 1, jnp.zeros(len(controls), cells.rate.dtype)
-    over = cells.rate[:, None] * crossings.normal
-    updates = Update(
-        1 - steps.at[at].add(cells.rate * cells.travel),
-        jnp.zeros_like(before.qvel).at[at].add(over),
-        jnp.zeros_like(before.qvel).at[at].add((1 - cells.since)[:, None] * over),
-        steps.at[at].add(cells.rate * moved_by_model(scene, model, before, events)),
-    )
+    cells = _cells(crossings, events, before.qvel, step_length)
+    over_velocity = (1 - cells.since)[:, None] * crossings.normal
+    slopes = jnp.concatenate([crossings.normal, over_velocity, -cells.travel[:, None]], axis=1)
+    by_model = cells.rate * moved_by_model(scene, model, before, events)
+    by_model = jnp.zeros(len(controls), by_model.dtype).at[events.step - 1].add(by_model)
 
     def follow(carry: tuple[State, Scalar], known: Any):
         state, earlier = carry
-        given, fixed, values, after, update, ahead, behind = known
+        given, fixed, values, after, own, of_model, near = known
         state = moving_values(fixed, state)
         control, cost = moving_values(values, acted(given, state))
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
-        change = tangent_of(jnp.sum(update.qpos * moved) + jnp.sum(update.qvel * (timestep * state.qvel)))
-        shift = update.kept * earlier + change + update.by_model
-        own: Motion = jax.tree.map(lambda one, other: weight * (shift * one + earlier * other), ahead, behind)
-        rest = integrate_position(scene.host, state.qpos, -own.qpos, 1.0), state.qvel - own.qvel
-        point = *rest, state.act - own.act, control - own.control
-        point = moving_values((fixed.qpos, fixed.qvel, fixed.act, values[0]), point)
+        moved = jnp.concatenate([moved, timestep * state.qvel - step_length * fixed.qvel, earlier[None]])
+        (change,) = tangent_of(along_events(cells.rate[:, None], slopes, own, moved))
+        shift = earlier + change + of_model
+        # halves of the differences to the step after and to the one before
+        ahead, behind = weight * near.ahead * shift / 2, weight * earlier / 2
+
+        def along(past: Array, here: Array, following: Array) -> Array:
+            return ahead * (following - here) + behind * (here - past)
+
+        way = -step_length * (ahead * after.qvel + behind * fixed.qvel)
+        rest = (
+            integrate_position(scene.host, state.qpos, way, 1.0),
+            state.qvel - along(near.qvel, fixed.qvel, after.qvel),
+            state.act - along(near.act, fixed.act, after.act),
+            control - along(near.control, values[0], near.next_control),
+        )
+        point = moving_values((fixed.qpos, fixed.qvel, fixed.act, values[0]), rest)
         qvel, act = known_step(scene, model, point, after)
-        qvel, act = qvel + own.qvel_after, act + own.act_after
+        qvel = qvel + along(fixed.qvel, after.qvel, near.next_qvel)
+        act = act + along(fixed.act, after.act, near.next_act)
         following = State(integrate_position(scene.host, state.qpos, qvel, timestep), qvel, act, after.warmstart)
         return (following, shift), (state, control, cost)
 
-    known = inputs, before, (controls, costs), after, updates, ahead, behind
+    own = tuple(jnp.append(jnp.minimum(each[1:], len(events.used)), 0) for each in (found.before, found.after))
+    known = inputs, before, (controls, costs), after, own, by_model, _neighbours(before, after, controls)
     none = jnp.zeros((), cells.rate.dtype)
     (moving, _), (states, controls, costs) = jax.lax.scan(follow, (start, none), known)
     counts = events.counts(past, cells.valid, cells.narrow, jnp.zeros_like(cells.rate), jnp.zeros_like(cells.valid))
     return moving_values(last, moving), (states, controls, residuals, costs), counts
 
 
-class Motion(NamedTuple):
-    """Half of what changes from one step to the next, for every step.
+class Neighbours(NamedTuple):
+    """What precedes and follows each step.
 
     Attributes:
-        qpos, qvel, act, control: of the state before the step and its control; positions as a displacement.
-        qvel_after, act_after: of the state after it.
+        qvel, act, control: before the preceding step, and its control; of the first step, its own.
+        next_qvel, next_act, next_control: after the following step, and its control; of the last step, its own.
+        ahead: 0 for the last step, otherwise 1.
     """
 
-    qpos: Float[Array, "steps nv"]
     qvel: Float[Array, "steps nv"]
     act: Float[Array, "steps na"]
     control: Float[Array, "steps nu"]
-    qvel_after: Float[Array, "steps nv"]
-    act_after: Float[Array, "steps na"]
+    next_qvel: Float[Array, "steps nv"]
+    next_act: Float[Array, "steps na"]
+    next_control: Float[Array, "steps nu"]
+    ahead: Float[Array, " steps"]
 
 
-def _halves(timestep: float | Scalar, before: State, last: State, controls: Controls) -> tuple[Motion, Motion]:
-    """From each step to the next, and to each step from the one before; zero where there is none."""
-    qvel, act = (jnp.concatenate([one, end[None]]) for one, end in ((before.qvel, last.qvel), (before.act, last.act)))
-    moved, sped, activated = timestep * qvel[1:] / 2, jnp.diff(qvel, axis=0) / 2, jnp.diff(act, axis=0) / 2
-    own = Motion(moved[:-1], sped[:-1], activated[:-1], jnp.diff(controls, axis=0) / 2, sped[1:], activated[1:])
-    ahead = jax.tree.map(lambda leaf: jnp.pad(leaf, ((0, 1), (0, 0))), own)
-    return ahead, jax.tree.map(lambda leaf: jnp.pad(leaf, ((1, 0), (0, 0))), own)
+def _neighbours(before: State, after: State, controls: Controls) -> Neighbours:
+    earlier = [jnp.concatenate([leaf[:1], leaf[:-1]]) for leaf in (before.qvel, before.act, controls)]
+    later = [jnp.concatenate([leaf[1:], leaf[-1:]]) for leaf in (after.qvel, after.act, controls)]
+    return Neighbours(*earlier, *later, ahead=jnp.ones(len(controls), before.qvel.dtype).at[-1].set(0))
 
 
 class Crossing(NamedTuple):
@@ -196,30 +204,17 @@ class Cells(NamedTuple):
     narrow: Bool[Array, " slots"]
 
 
-def _cells(crossings: Crossing, events: Events, ahead: Motion, behind: Motion, timestep: float | Scalar) -> Cells:
+def _cells(crossings: Crossing, events: Events, qvel: Float[Array, "steps nv"], timestep: float | Scalar) -> Cells:
+    """Cells from the velocities before every step."""
     at, sign = events.step - 1, jnp.where(events.ends, 1, -1)
-    moved, sped = (  # z before step k - 1, in which there is nothing behind the first
-        (one + other).at[0].multiply(2)[at] for one, other in ((ahead.qpos, behind.qpos), (ahead.qvel, behind.qvel))
-    )
+    past, here, after = qvel[jnp.maximum(at - 1, 0)], qvel[at], qvel[events.step]
+    between = (at > 0)[:, None]  # z before step k - 1, in which there is nothing behind the first
+    moved = timestep * jnp.where(between, (here + after) / 2, after)
+    sped = jnp.where(between, (after - past) / 2, after - here)
     path = moved + timestep * (1 - crossings.since)[:, None] * sped
     travel = jnp.sum(crossings.normal * path, axis=-1)
     valid = events.used & crossings.valid & (travel * sign > 0)
     width = jnp.where(valid, sign * jnp.maximum(jnp.abs(travel), crossings.least), 1.0)
-    number = jnp.zeros(len(ahead.qpos), travel.dtype).at[at].add(valid)[at]
+    number = jnp.zeros(len(qvel), travel.dtype).at[at].add(valid)[at]
     rate = jnp.where(valid, 1 / (jnp.maximum(number, 1) * width), 0.0)
     return Cells(travel, rate, crossings.since, valid, valid & (jnp.abs(travel) < crossings.least))
-
-
-class Update(NamedTuple):
-    """How the shift changes before each step.
-
-    Attributes:
-        kept: factor of the shift before.
-        qpos, qvel: what multiplies the derivative of the position, and that of the velocity times the timestep.
-        by_model: zero, with the derivative over the model.
-    """
-
-    kept: Float[Array, " steps"]
-    qpos: Float[Array, "steps nv"]
-    qvel: Float[Array, "steps nv"]
-    by_model: Float[Array, " steps"]
