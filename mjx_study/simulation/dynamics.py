@@ -170,13 +170,8 @@ def _forced(scene: Scene, model: mjx.Model, qpos: Qpos, qvel: Qvel, act: Act, co
     return force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
 
 
-def solved_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, guards.Course]:
-    """`step` without derivatives, and the course of the guards in it."""
-    return with_solver(partial(observed_step, scene), model, state, control)
-
-
 def observed_step(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Array):
-    """`solved_step` with a solver, in MJX's operations."""
+    """`step` with a solver, without derivatives, and the course of the guards in it."""
     after, residual, data = _solved(solver, scene, model, state, control)
     return after, residual, guards.course(model, data, state.qvel, after.qvel, after.warmstart)
 

@@ -389,7 +389,7 @@ class Passages(NamedTuple):
     """Two steps from the touch of a guard, first with its rows on, then with them off.
 
     Attributes:
-        qvel, act: velocity and activations after them.
+        qvel: velocity after them.
         qacc: acceleration in them.
         normal: derivative of the guard's distance.
         rate, spring: the larger of `guards.relaxation_rates`, and the spring's.
@@ -397,7 +397,6 @@ class Passages(NamedTuple):
     """
 
     qvel: Float[Array, "*cases 2 nv"]
-    act: Float[Array, "*cases 2 na"]
     qacc: Float[Array, "*cases 2 nv"]
     normal: Float[Array, "*cases nv"]
     rate: Float[Array, "*cases"]
@@ -427,16 +426,16 @@ def passages(
     forced = force_stage(model, positioned, qvel, act, control)
     touching = guards.at_first_touch(model, forced, guard.touching)
 
-    def step(removed: Rows, warmstart: Qvel) -> tuple[Qvel, Act, Qvel]:
+    def step(removed: Rows, warmstart: Qvel) -> tuple[Qvel, Qvel]:
         prepared = guards.without(touching, removed)
         qacc = solver(model, prepared.replace(qacc_warmstart=warmstart))
-        return *advance_velocity(model, prepared, qacc), qacc
+        return advance_velocity(model, prepared, qacc)[0], qacc
 
     on, off = step(guard.absent, warmstart[0]), step(guard.absent + guard.members, warmstart[1])
-    qvel, act, qacc = (jnp.stack(each) for each in zip(on, off, strict=True))
+    qvel, qacc = (jnp.stack(each) for each in zip(on, off, strict=True))
     damper, spring = guards.relaxation_rates(model, positioned.replace(qvel=closing), guard.weights)
     rate = jnp.maximum(damper, spring)
-    return Passages(qvel, act, qacc, guard.normal, rate, spring, guard.deep)
+    return Passages(qvel, qacc, guard.normal, rate, spring, guard.deep)
 
 
 def least_travel(model: mjx.Model, across: Float[Array, " 2"], either: Bool[Array, ""], rate: Scalar) -> Scalar:

@@ -75,7 +75,7 @@ def shifted(
 ) -> tuple[State, tuple[State, Controls, Float[Array, " horizon"], Any], OnsetCounts]:
     """`dynamics.simulated` with the same values, but derivatives that include the onset term by shifts in time.
 
-    Arguments, results and derivatives are those of `onset.corrected`.
+    Arguments, results and derivatives are those of `onset.corrected`, but for twice its slots, which cost little here.
     """
     if not guards.num_guards(scene.template):
         found = simulated(scene, model, start, control_law, inputs, running_cost)
@@ -84,7 +84,7 @@ def shifted(
     step_length, acted = timestep_of(scene, fixed_model), acting(control_law, running_cost)
     last, past, known = observed_rollout(scene, fixed_model, start, acted, inputs)
     before, controls, after, residuals, costs, found = known
-    events = events_of(found, slots_for(scene, len(controls)) if slots is None else slots)
+    events = events_of(found, 2 * slots_for(scene, len(controls)) if slots is None else slots)
     crossings = over_events(partial(_crossing_of, scene, fixed_model, before, after), events)
     cells = _cells(crossings, events, before.qvel, step_length)
     over_velocity = (1 - cells.since)[:, None] * crossings.normal
