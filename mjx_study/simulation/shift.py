@@ -2,21 +2,25 @@ r"""The onset term by shifts in time: `--onset shift`.
 
 A rollout in which contact begins a step later is the rollout itself, a step late, as long as nothing but its state
 moves it. So its own states tell what a shift of an event changes, to all orders in the contact's damping and however
-many events follow: with z_k = (x_{k+1} - x_{k-1})/2, the derivative dx_k is split into a shift by a steps and the rest,
+many events follow. With states x_k, controls u_k and z_k = (x_{k+1} - x_{k-1})/2, the derivative dx_k is split into a
+shift by a steps and the rest,
 
     dx_{k+1} = A_k (dx_k - a z_k) + B_k (du_k - a w_k) + a z_{k+1},     w_k = (u_{k+1} - u_{k-1})/2,
 
 where A and B are the step's own derivatives. Where no event is near, that is A_k dx_k + B_k du_k up to curvature, and a
-makes no difference. Before step k - 1, if contact begins or ends at step k, the rest of the derivative is made one that
-leaves the time of touch as it is:
+makes no difference. a starts from 0. If contact begins or ends at step k, then before step k - 1 it is chosen so that
+the rest leaves the time of touch unchanged:
 
     a <- a + n^T (dq - a z^q + (1 - s) h (dv - a z^v)) / D,     D = n^T (z^q + (1 - s) h z^v),
 
-with n the derivative of the guard's distance and s the share of a step since the touch. For touches spread evenly over
-a cell, the mean of the derivative of the cost along a shift is the difference of the cost over a whole step, which this
-computes; that half of each difference looks ahead and half behind makes the error one of second order in the step over
-the spread. Since a whole step's shift is mapped to a whole step's shift whatever s, events at fixed intervals, whose s
-are not spread, are right, too, and the variance over s vanishes.
+with n the derivative of the guard's distance, s the share of a step since the touch, and z = (z^q, z^v) its parts of
+position and velocity. The half of z that looks ahead has this a at once, the half that looks behind a step later; the
+first and the last step have one half only.
+
+For touches spread evenly over a cell, the mean of the derivative of the cost along a shift is the difference of the
+cost over a whole step, which this computes; that half of each difference looks ahead and half behind makes the error
+one of second order in the step over the spread. Since a whole step's shift is mapped to a whole step's shift whatever
+s, events at fixed intervals, whose s are not spread, are right, too, and the variance over s vanishes.
 
 Events of one step share a equally. A cell narrower than in `onset.least_travel` counts as that wide: only what a lacks
 is then taken too small. Bodies on several feet, each with noise of its own, have one a: there the term of

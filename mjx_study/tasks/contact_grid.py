@@ -206,7 +206,7 @@ def _contact(
     """Build a family's contact model with a damping [N s/m]; by default the task's, if the family has none."""
     law = bool(laws_of([family]))
     if law and task.onset != "none":
-        raise OptionError("onset", f"is for MuJoCo's law, whose force jumps; {family} needs none: omit it")
+        raise OptionError("onset", f"is for MuJoCo's law, and {family} is another: omit it")
     if damping is None and family in FAMILIES and FAMILIES[family].dampratio == 0 and not law:
         damping = task.defaults.damping
     damping = None if stiffness is None else damping
