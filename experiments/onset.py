@@ -108,19 +108,22 @@ def tennis() -> None:
 
 def stiffness() -> None:
     """Write slopes, means and deviations of first-order gradients through springs and smooth onsets."""
-    task, position, rows = make_task("momentum_transfer"), np.array([0.5]), []
-    points = grid(0.5, 0.5, task.sigma, POINTS, task.noise)
-    for family in ("penalty", "smooth_onset"):
-        for cell in family_grid(task, (family,))[0]:
-            (plain, plain_deviations), (shift, shift_deviations) = (
-                measured(task.replace(onset=onset), cell.contact, points, position) for onset in ("none", "shift")
-            )
-            off = (percent(abs(each.first[0] / each.slope[0] - 1), 3) for each in (plain, shift))
-            deviations = *plain_deviations[0], shift_deviations[0][1]
-            slope = f"{plain.slope[0]:.5f} ± {plain.slope_error[0]:.1g}"
-            rows.append((f"`{family}`", f"{cell.stiffness:g}", slope, *off, *(f"{each:.2g}" for each in deviations)))
-            print(rows[-1], flush=True)
-    names = "family", "K [N/m]", "slope", "E[FoBG] off by", "with shifts", "deviation: ZoBG", "FoBG", "with shifts"
+    rows = []
+    for name, angle in (("momentum_transfer", 0.5), ("ball_wall", 0.2)):
+        task, position = make_task(name), np.array([angle])
+        points = grid(angle, angle, task.sigma, POINTS, task.noise)
+        for family in ("penalty", "smooth_onset"):
+            for cell in family_grid(task, (family,))[0]:
+                (plain, plain_deviations), (shift, shift_deviations) = (
+                    measured(task.replace(onset=onset), cell.contact, points, position) for onset in ("none", "shift")
+                )
+                off = (percent(abs(each.first[0] / each.slope[0] - 1), 3) for each in (plain, shift))
+                deviations = *plain_deviations[0], shift_deviations[0][1]
+                slope = f"{plain.slope[0]:.5f} ± {plain.slope_error[0]:.1g}"
+                cells = f"{cell.stiffness:g}", slope, *off, *(f"{each:.2g}" for each in deviations)
+                rows.append((f"`{name}`, `{family}`", *cells))
+                print(rows[-1], flush=True)
+    names = "", "K [N/m]", "slope", "E[FoBG] off by", "with shifts", "deviation: ZoBG", "FoBG", "with shifts"
     write_tables(DOCS / "onset-correction.md", {"stiffness": markdown_table(rows, names)})
 
 
