@@ -71,11 +71,12 @@ def measured(
     for at in position:
         w = (points - at) / task.sigma
         zeroth = (values - np.interp(at, points, values)) * w / task.sigma  # Gaussian noise
-        deviations.append([_deviation(each, noise.density(w)) for each in (zeroth, slopes)])
+        deviations.append([deviation(each, noise.density(w)) for each in (zeroth, slopes)])
     return means(points, values, slopes, position, task.sigma, task.noise), deviations
 
 
-def _deviation(samples: np.ndarray, weights: np.ndarray) -> float:
+def deviation(samples: np.ndarray, weights: np.ndarray) -> float:
+    """Standard deviation of weighted samples."""
     mean = np.average(samples, weights=weights)
     return float(np.average((samples - mean) ** 2, weights=weights) ** 0.5)
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from estimators import NOISES
 from experiments import DATA, DOCS, read_lines
+from experiments.onset import deviation
 from experiments.pages import write_tables
 from experiments.starts import task_of_start
 from mjx_study.experiment.quadrature import Line, grid, means
@@ -164,8 +165,7 @@ def measured(case: Case, milliseconds: float) -> dict[str, Any]:
         values, slopes = Line(task.replace(onset=onset))(points, None)
         each = means(points, values, slopes, np.array([case.at]), case.sigma, task.noise)
         weights = NOISES[task.noise].density((points - case.at) / case.sigma)
-        deviation = np.average((slopes - each.first) ** 2, weights=weights) ** 0.5
-        found[onset] = float(each.first[0]), float(each.first_error[0]), float(deviation)
+        found[onset] = float(each.first[0]), float(each.first_error[0]), deviation(slopes, weights)
         found["slope"] = float(each.slope[0]), float(each.slope_error[0])
     return {name: [float(f"{value:.6g}") for value in values] for name, values in found.items()}
 

@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.figures.rollouts import BLUE, GREEN, GREY, INK, ORANGE, contact_of, task_of
+from experiments.onset import measured
 from experiments.pages import DPI
 from mjx_study.experiment.landscapes import Line, grid, means
 
@@ -42,7 +43,6 @@ def stiffness_figure() -> Figure:
     """Draw deviations of one gradient against stiffness: zeroth order, first order, the same with shifts."""
     task, angle, stiffness = task_of("momentum_transfer"), 0.5, np.geomspace(300, 1e5, 16)
     points = grid(angle, angle, task.sigma, 2000, task.noise)
-    weights = np.exp(-(((points - angle) / task.sigma) ** 2) / 2)
     figure = Figure(figsize=(9.0, 3.4), dpi=DPI, layout="constrained")
     every = figure.subplots(1, 2, sharey=True)
     for axes, family, title in zip(
@@ -51,22 +51,16 @@ def stiffness_figure() -> Figure:
         deviations = []
         for each in stiffness:
             contact = contact_of(task, family, each)
-            (values, plain), (_, shift) = (
-                Line(task.replace(onset=onset))(points, contact) for onset in ("none", "shift")
+            (_, ((zeroth, plain),)), (_, ((_, shift),)) = (
+                measured(task.replace(onset=onset), contact, points, np.array([angle])) for onset in ("none", "shift")
             )
-            zeroth = (values - np.interp(angle, points, values)) * (points - angle) / task.sigma**2
-            deviations.append([_deviation(samples, weights) for samples in (zeroth, plain, shift)])
+            deviations.append([zeroth, plain, shift])
         labels = ("zeroth order", BLUE), ("first order", ORANGE), ("first order with shifts in time", GREEN)
         for (label, colour), each in zip(labels, np.array(deviations).T, strict=True):
             axes.loglog(stiffness, each, color=colour, marker="o", markersize=3, linewidth=1.5, label=label)
-        axes.set_title(f"{title} (`{family}`)".replace("`", ""), fontsize=10)
+        axes.set_title(f"{title} ({family})", fontsize=10)
         axes.set_xlabel("contact stiffness [N/m]")
         axes.grid(alpha=0.25)
     every[0].set_ylabel("standard deviation of one gradient")
     every[1].legend(frameon=False, fontsize=8.5)
     return figure
-
-
-def _deviation(samples: np.ndarray, weights: np.ndarray) -> float:
-    mean = np.average(samples, weights=weights)
-    return float(np.average((samples - mean) ** 2, weights=weights) ** 0.5)
