@@ -47,6 +47,8 @@ ROBOTS: Final[dict[str, Path]] = {
     "quadruped": ROOT / "models" / "quadruped.xml",
     "humanoid": TESTED / "humanoid" / "humanoid.xml",
     "barkour_v0": TESTED / "barkour_v0" / "assets" / "barkour_v0_mjx.xml",
+    "02_humanoids": TESTED / "humanoid" / "02_humanoids.xml",
+    "shadow_hand": TESTED / "shadow_hand" / "scene_right.xml",
 }
 ROUTES: Final = "native", "xla", "stock", "engine"
 COLUMNS: Final = {
@@ -179,6 +181,8 @@ def write_page() -> None:
     for platform in sorted({platform for platform, *_ in rows}):
         lines = []
         for name in ROBOTS:
+            if (platform, name, "native") not in rows:
+                continue
             found = {route: rows.get((platform, name, route), {}) for route in ROUTES}
             rates = [found[route].get(kind, {}).get("rate", math.nan) for route, kind in COLUMNS]
             built = " + ".join(number(each["built"]) for each in found["native"].values())

@@ -140,8 +140,11 @@ def main() -> None:
     """Write the table."""
     mjx_study.configure()
     found, lines = results(), []
-    for name in ROBOTS:
-        rate = 1e6 * found["gpu", name, "native", SAMPLES["gpu"], "float64"]["rollouts"]["rate"]
+    measured = {name: found.get(("gpu", name, "native", SAMPLES["gpu"], "float64")) for name in ROBOTS}
+    for name, rates in measured.items():
+        if rates is None:
+            continue
+        rate = 1e6 * rates["rollouts"]["rate"]
         operations, memory = work(name)
         shares = f"{rate * operations / OPERATIONS:.0%}", f"{rate * memory / BANDWIDTH:.0%}"
         lines.append([f"`{name}`", number(rate / 1e6), f"{operations:,.0f}", f"{memory / 1e3:,.0f}", *shares])

@@ -12,6 +12,7 @@ from mjx_study.graph.c import source_of
 from mjx_study.graph.function import capture
 from mjx_study.graph.indexing import FEWEST_ROWS
 from mjx_study.graph.native import SWITCH
+from mjx_study.graph.nodes import TooLargeError
 from mjx_study.graph.scalars import traced_part, unrolled
 
 ROUTES = [pytest.param("1", id="C"), pytest.param("0", id="NumPy"), pytest.param("xla", id="operations")]
@@ -257,7 +258,7 @@ def test_a_sum_of_zeros_is_not_negative(function, native, monkeypatch):
 def test_values_alone_can_be_too_large(monkeypatch):
     """A call with its own derivative is one operation, unless only values are wanted."""
     monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", 9)
-    monkeypatch.setattr(scalars, "MOST_NATIVE", 9)
+    monkeypatch.setitem(scalars.MOST_NATIVE, "cpu", 9)
 
     @jax.custom_jvp
     def long(x):
@@ -273,10 +274,30 @@ def test_a_constant_zero_times_infinity_is_zero():
     assert jax.jit(lambda x: unrolled(lambda y: jnp.asarray([0.0, 1.0]) * y, x))(jnp.inf).tolist() == [0.0, np.inf]
 
 
+def test_chains_of_any_length():
+    """A product and a sum of more terms than Python nests calls, below a fraction."""
+    terms = np.linspace(0.9, 1.1, 1500)
+
+    def function(x):
+        product, _ = jax.lax.scan(lambda found, each: (found * each * x, None), x, terms)
+        return 1 / product + 1 / jnp.sum(terms * x)
+
+    points = jnp.array([0.999, 1.0])
+    found = jax.jit(jax.vmap(lambda x: unrolled(function, x)))(points)
+    np.testing.assert_allclose(found, jax.vmap(function)(points), rtol=1e-11)
+
+
+def test_what_is_far_too_large_is_refused_before_it_is_written_out():
+    """A product of matrices that takes 1e12 multiplications."""
+    wide = jax.ShapeDtypeStruct((10_000, 10_000), float)
+    with pytest.raises(TooLargeError):
+        capture(lambda x: x @ x, wide, most=1_000_000)
+
+
 @pytest.mark.parametrize("most", [3, 11])
 def test_what_is_too_large_is_left_as_it_is(monkeypatch, most):
     monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", most)
-    monkeypatch.setattr(scalars, "MOST_NATIVE", most)
+    monkeypatch.setitem(scalars.MOST_NATIVE, "cpu", most)
     function = lambda x: jnp.outer(x, x) @ jnp.cos(x)  # noqa: E731
     assert _operations(lambda x: unrolled(function, x), ROW) == _operations(function, ROW)
 

@@ -157,7 +157,9 @@ def test_operations_of_integers(name, kind):
 @pytest.mark.parametrize("name", ["loops", "several computed indices", "whole arrays", "computed slice"])
 @pytest.mark.parametrize("most", [10, 60])
 def test_long_functions_are_divided(monkeypatch, name, most):
+    """And their parts compiled in several files."""
     monkeypatch.setitem(c.MOST_TOGETHER, "cpu", (most, most))
+    monkeypatch.setattr(c, "MOST_IN_SHARE", 20 * most)
     points = np.random.default_rng(0).normal(size=(9, 3))
     compare(lambda x: jax.tree.map(lambda leaf: leaf + most, FUNCTIONS[name](x)), points)
 

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +25,7 @@ import jax.ffi
 from mjx_study.caches import read_cached, write_cached
 from mjx_study.disk import temporary_folder
 from mjx_study.graph import cuda, numpy_code
+from mjx_study.graph.c import SHARE
 from mjx_study.runtime import available_cores, libraries_folder, processor
 from mjx_study.version import version_of
 from mjx_study.watchdog import elsewhere
@@ -61,6 +62,11 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
         file=sys.stderr,
     )
     return None
+
+
+def _command() -> tuple[str, ...]:
+    found = compiler()
+    return found[0] if found else ("cc",)
 
 
 @functools.cache
@@ -125,8 +131,7 @@ def libraries_in(content: bytes) -> set[str]:
 def _finish(name: str, source: str, future: Future[Any]) -> None:
     found = None
     try:
-        with _AT_ONCE:
-            found = _cached(name) or _build(name, source)
+        found = _cached(name) or _build(name, source)
     finally:
         future.set_result(found)
 
@@ -137,20 +142,33 @@ def _build(name: str, source: str) -> Any:
     with temporary_folder() as folder:
         written, library = Path(folder, f"{name}.c"), Path(folder, f"{name}.so")
         written.write_text(source)
-        command, _ = compiler() or (("cc",), "")
-        include = f"-I{jax.ffi.include_dir()}"
         with elsewhere():
             if (target := cuda.target()) is not None:
                 try:
                     Path(folder, "kernel").write_bytes(cuda.compile_kernel(source, target.split()[1]))
                 except ValueError as error:
                     return _failed(written, "NVRTC", str(error))
-            flags = *(WELL if len(source) < LONG else QUICKLY), *_flags_here()
-            done = _run(*command, *flags, include, written.name, "-o", library.name, "-lm", "-ldl", folder=folder)
+            done = _compiled(source, library)
         if done.returncode:
-            return _failed(written, shlex.join(command), done.stderr)
+            return _failed(written, shlex.join(_command()), done.stderr)
         content = library.read_bytes()
     return _kept(name, content)
+
+
+def _compiled(source: str, library: Path) -> subprocess.CompletedProcess[str]:
+    """Compile the shares of a source, at once as far as there are cores, and link them."""
+    flags = *_command(), *(WELL if len(source) < LONG else QUICKLY), *_flags_here(), f"-I{jax.ffi.include_dir()}"
+    folder, (head, *shares) = library.parent, source.split(SHARE)
+
+    def one(number: int) -> subprocess.CompletedProcess[str]:
+        Path(folder, f"{number}.c").write_text(head + shares[number] if shares else head)
+        return _run(*flags, "-c", f"{number}.c", folder=folder)
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        done = list(pool.map(one, range(max(len(shares), 1))))
+    objects = (f"{number}.o" for number in range(len(done)))
+    failed = next((each for each in done if each.returncode), None)
+    return failed or _run(*flags, *objects, "-o", library.name, "-lm", "-ldl", folder=folder)
 
 
 def _kept(name: str, content: bytes) -> Any:
@@ -167,9 +185,10 @@ def _failed(written: Path, compiler: str, errors: str) -> None:
     print(f"mjx-study: {compiler} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)
 
 
-def _run(*command: str, folder: str | None = None) -> subprocess.CompletedProcess[str]:
+def _run(*command: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
     try:
-        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=MOST_SECONDS)
+        with _AT_ONCE:
+            return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=MOST_SECONDS)
     except (OSError, subprocess.TimeoutExpired) as error:
         return subprocess.CompletedProcess(command, 1, "", str(error))
 

@@ -16,7 +16,7 @@ from jax import lax
 from jax.core import ShapedArray
 
 from mjx_study.graph.function import Passes, ScalarFunction, depending_on
-from mjx_study.graph.nodes import ELEMENTWISE, Node, depth_first, entries_of
+from mjx_study.graph.nodes import ELEMENTWISE, Node, collection_paused, depth_first, entries_of
 from mjx_study.graph.parts import Loop, Statement, in_parts
 
 COMPARISONS: Final = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
@@ -35,6 +35,9 @@ MAX_ARGUMENT: Final = 4000  # maximum size of a kernel's argument [bytes]
 MOST_TOGETHER: Final = {"cpu": (500, 500), "gpu": (20_000, 20_000), "gpu, long": (5_000, 20_000)}
 """Maximum numbers of lines in a function and in a loop that stays in one; compilers allocate registers in more than
 linear time."""
+SHARE: Final = "\n// The next share\n"
+"""Beginning of a share of a source in C, which is compiled apart, after what precedes all shares."""
+MOST_IN_SHARE: Final = 200_000  # size from which functions are divided into shares [characters]
 LONG_KERNEL: Final = 40_000
 """Operations from which a kernel is compiled as separate functions, in a third of the time, to run at 0.7 of the
 speed."""
@@ -44,6 +47,7 @@ class NotWrittenError(Exception):
     """The graph has an operation or a type that C is not written for."""
 
 
+@collection_paused()
 def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | None = None) -> str:
     """Write a function of arrays as C: a handler of XLA's foreign function interface for batches of samples.
 
@@ -67,6 +71,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
             [_batch(inputs, outputs), f"#define KEPT {num_kept}", f"#define LONG {int(is_long)}", *parts, ""]
         )
     wide = any(dtype.itemsize == 8 for dtype in writer.dtypes)
+    *parts, driver = functions
     return "\n".join(
         [
             f"#define WIDE {int(wide)}",
@@ -77,10 +82,17 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
             _text("prelude.c"),
             _text("functions.c"),
             *writer.tables,
-            *functions,
-            _text("handler.c"),
+            *(f"{each.partition(' {')[0]};" for each in parts),
+            *_shares([*parts, f"{driver}\n{_text('handler.c')}"]),
         ]
     )
+
+
+def _shares(functions: Sequence[str]) -> list[str]:
+    """Functions in turn, in shares of about `MOST_IN_SHARE` characters."""
+    starts = itertools.accumulate(map(len, functions), initial=0)
+    grouped = itertools.groupby(zip(starts, functions, strict=False), lambda each: each[0] // MOST_IN_SHARE)
+    return [SHARE + "\n".join(function for _, function in group) for _, group in grouped]
 
 
 def _batch(inputs: Sequence[ShapedArray], outputs: Sequence[ShapedArray]) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 
 from mjx_study.graph.function import run
-from mjx_study.graph.nodes import Node, ScalarGraph, entries_of, filled, needed_for
+from mjx_study.graph.nodes import Node, ScalarGraph, collection_paused, entries_of, filled, needed_for
 
 Sparse = dict[int, Any]
 """Entries by column; others are zero."""
@@ -35,6 +35,7 @@ class NotDifferentiableError(Exception):
     """The derivative would have to pass a loop or an operation on whole arrays."""
 
 
+@collection_paused()
 def push(
     graph: ScalarGraph, outputs: Sequence[np.ndarray], inputs: Sequence[np.ndarray], changes: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
@@ -47,6 +48,7 @@ def push(
     return _arrays(outputs, _pushed(graph, entries_of(outputs), seeds))
 
 
+@collection_paused()
 def pull(
     graph: ScalarGraph, outputs: Sequence[np.ndarray], inputs: Sequence[np.ndarray], adjoints: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
@@ -95,18 +97,36 @@ def _taken(graph: ScalarGraph, which: Any, case: int) -> tuple[Any, bool]:
 
 
 def _gathered(graph: ScalarGraph, parts: dict[Conditions, Any], dtype: Any) -> tuple[Any, Conditions]:
-    """Sum of the parts of an adjoint, and the conditions under which it counts."""
-    parts = dict(parts)
-    while len(parts) > 1:
-        where = max(parts, key=len)
-        here, outer, (condition, value) = parts.pop(where), where[:-1], where[-1]
-        other = parts.pop((*outer, (condition, not value)), dtype.type(0))
-        cases = (other, here) if value else (here, other)
-        _accumulate(graph, parts, {outer: graph.scalar(lax.select_n_p, (condition, *cases), dtype)}, dtype)
-    ((where, adjoint),) = parts.items()
-    return adjoint, where
+    """Sum of the parts of an adjoint, and the conditions under which it counts: those that all parts have first, and
+    that any part's hold."""
+    total: dict[Conditions, Any] = {}
+    left = dict(parts)
+    while len(left) > 1:
+        where = max(left, key=len)
+        here, outer, (condition, value) = left.pop(where), where[:-1], where[-1]
+        other = left.pop((*outer, (condition, not value)), None)
+        if other is None:
+            total[where] = here
+        else:
+            cases = (other, here) if value else (here, other)
+            _accumulate(graph, left, {outer: graph.scalar(lax.select_n_p, (condition, *cases), dtype)}, dtype)
+    total |= left
+    alike = itertools.takewhile(lambda column: len(set(column)) == 1, zip(*total, strict=False))
+    shared = tuple(first for first, *_ in alike)
+    found: dict[Conditions, Any] = {}
+    some: Any = np.bool_(False)
+    for where, adjoint in total.items():
+        holds: Any = np.bool_(True)
+        for condition, value in where[len(shared) :]:
+            condition = condition if value else graph.scalar(lax.not_p, (condition,), _BOOL)
+            holds = graph.scalar(lax.and_p, (holds, condition), _BOOL)
+        some = graph.scalar(lax.or_p, (some, holds), _BOOL)
+        part = graph.scalar(lax.select_n_p, (holds, dtype.type(0), adjoint), dtype)
+        _accumulate(graph, found, {shared: part}, dtype)
+    return found.get(shared, dtype.type(0)), (*shared, (some, True)) if isinstance(some, Node) else shared
 
 
+@collection_paused()
 def jacobian(graph: ScalarGraph, outputs: np.ndarray, inputs: np.ndarray) -> np.ndarray:
     """Matrix of the derivatives of a vector of outputs over a vector of inputs, by forward mode.
 

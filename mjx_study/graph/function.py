@@ -12,13 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray, Tracer
-from jax.extend.core import Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from mjx_study.graph.nodes import ELEMENTWISE, Node, ScalarGraph, constants, entries_of, filled, needed_for
+from mjx_study.graph.nodes import (
+    ELEMENTWISE,
+    Node,
+    ScalarGraph,
+    TooLargeError,
+    collection_paused,
+    constants,
+    entries_of,
+    filled,
+    needed_for,
+)
 from mjx_study.graph.rules import RULES
 
 MOST_KEPT: Final = 64
 """Maximum number of functions of a kind that are kept."""
+MOST_FOLDED: Final = 10
+"""Maximum number of entries that a function computes, in multiples of the scalar operations allowed; robots have 2 to 9
+times as many entries as operations."""
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 _WITH_RULES: Final = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "ruled": "jaxpr"}
@@ -112,6 +125,7 @@ def is_input(leaf: Any) -> bool:
     return isinstance(leaf, Tracer | jax.ShapeDtypeStruct)
 
 
+@collection_paused()
 def capture(function: Callable[..., Any], *arguments: Any, most: int, values_only: bool = False) -> ScalarFunction:
     """Write `function(*arguments)` out as a graph.
 
@@ -124,12 +138,36 @@ def capture(function: Callable[..., Any], *arguments: Any, most: int, values_onl
         TooLargeError: it has more operations.
     """
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    if _entries(jaxpr.jaxpr) > MOST_FOLDED * most:
+        raise TooLargeError
     graph, leaves = ScalarGraph(most, values_only), jax.tree.leaves(arguments)
     arrays = [graph.fresh("input", leaf.shape, leaf.dtype) if is_input(leaf) else constants(leaf) for leaf in leaves]
     outputs = run(graph, jaxpr, arrays)
     graph.most = None
     inputs = [array for array, leaf in zip(arrays, leaves, strict=True) if is_input(leaf)]
     return ScalarFunction(graph, inputs, outputs, jaxpr.out_avals, jax.tree.structure(shape))
+
+
+def _entries(jaxpr: Jaxpr) -> int:
+    """Number of scalars that a program computes, those of a loop's pass once."""
+    total = 0
+    for equation in jaxpr.eqns:
+        outputs: list[Any] = [each.aval for each in equation.outvars]
+        size = sum(math.prod(each.shape) for each in outputs)
+        if equation.primitive.name == "dot_general":
+            left: Any = equation.invars[0].aval
+            (summed, _), _ = equation.params["dimension_numbers"]
+            size *= math.prod(left.shape[axis] for axis in summed)
+        total += sum(map(_entries, programs_in(equation))) or size
+    return total
+
+
+def programs_in(equation: Any) -> list[Jaxpr]:
+    """Programs that an operation calls."""
+    found = []
+    for each in jax.tree.leaves(equation.params, is_leaf=lambda leaf: isinstance(leaf, ClosedJaxpr | Jaxpr)):
+        found += [each.jaxpr] if isinstance(each, ClosedJaxpr) else [each] if isinstance(each, Jaxpr) else []
+    return found
 
 
 def inlined(graph: ScalarGraph, function: Callable[..., Any], *arrays: np.ndarray) -> list[np.ndarray]:

@@ -1,8 +1,10 @@
 """Graphs of scalar operations with constant folding and common subexpression elimination."""
 
+import gc
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 import jax
@@ -42,11 +44,25 @@ _OF_SIGNED_ZEROS: Final = frozenset({"atan2", "div", "integer_pow", "pow", "rsqr
 """Operations that take 0 and -0 to numbers far apart; a quotient only below the line."""
 _KEEPS_SIGNED_ZEROS: Final = frozenset({"div", "max", "min", "mul", "neg", "select_n", "sqrt"})
 """Operations whose result may be -0 because an argument is."""
+_PLAIN: Final = frozenset({"add", "add_any", "and", "div", "eq", "ge", "gt", "le", "lt", "mul", "ne", "or", "sub"})
+"""Operations that only constants simplify."""
 _COMMUTATIVE: Final = frozenset({"add", "add_any", "and", "eq", "max", "min", "mul", "ne", "or"})
 
 
 class TooLargeError(Exception):
     """The graph has too many scalars to be worth compiling."""
+
+
+@contextmanager
+def collection_paused() -> Generator[None]:
+    """Without Python's garbage collection, which takes a third of the time that large graphs do, and finds nothing."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class Node:
@@ -82,6 +98,7 @@ class ScalarGraph:
         self._known: dict[Any, Node] = {}
         self._sums: set[int] = set()
         self._from_zero: dict[int, Any] = {}
+        self._never_minus_zero: set[int] = set()
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:
         self._count += 1
@@ -103,20 +120,35 @@ class ScalarGraph:
     def scalar(self, primitive: Any, arguments: tuple[Any, ...], dtype: Any, **parameters: Any) -> Any:
         """Return one entry of an elementwise operation: a constant, an existing node, or a new one."""
         name = primitive.name
-        if not any(isinstance(each, Node) for each in arguments):
+        numbers = [each.number if isinstance(each, Node) else 0 for each in arguments]
+        if not any(numbers):
             return _folded(primitive, arguments, dtype, parameters)
         if name in _OF_SIGNED_ZEROS and dtype.kind == "f":
             first, *others = arguments
             first = first if name == "div" else self._signed(first)
             arguments = first, *map(self._signed, others)
-        if (simpler := self._simpler(name, arguments, dtype)) is not None:
-            return simpler
-        if name in _COMMUTATIVE:
-            arguments = tuple(sorted(arguments, key=lambda each: each.number if isinstance(each, Node) else 0))
-        key = name, tuple(map(_identity, arguments)), dtype, str(parameters) if parameters else ""
-        if key not in self._known:
-            self._known[key] = self.node(primitive, arguments, parameters, dtype)
-        return self._known[key]
+            numbers = [each.number if isinstance(each, Node) else 0 for each in arguments]
+        if name not in _PLAIN or not all(numbers):
+            if (simpler := self._simpler(name, arguments, dtype)) is not None:
+                return simpler
+        if name in _COMMUTATIVE and numbers[0] > numbers[1]:
+            arguments, numbers = arguments[::-1], numbers[::-1]
+        identities = numbers if all(numbers) else map(_identity, arguments)
+        key = name, *identities, dtype, str(parameters) if parameters else ""
+        node = self._known.get(key)
+        if node is None:
+            self._known[key] = node = self.node(primitive, arguments, parameters, dtype)
+            if name in ("abs", "square") or (name == "mul" and arguments[0] is arguments[1]):
+                self._never_minus_zero.add(node.number)
+            elif name in ("add", "add_any") and not all(map(self._may_be_minus_zero, arguments)):
+                self._never_minus_zero.add(node.number)
+        return node
+
+    def _may_be_minus_zero(self, value: Any) -> bool:
+        """Whether a value may be -0; squares are not, nor sums with them."""
+        if isinstance(value, Node):
+            return value.number not in self._never_minus_zero
+        return bool(value == 0 and np.signbit(value))
 
     def _simpler(self, name: str, arguments: tuple[Any, ...], dtype: Any) -> Any:
         """Simplify an operation with constant or equal arguments; None if impossible."""
@@ -155,19 +187,26 @@ class ScalarGraph:
 
         Sums begin with 0, and so are never -0. Graphs leave out that 0, which only makes a difference to `1 / x`.
         """
-        if not isinstance(value, Node):
-            return value
-        if value.number not in self._from_zero:
-            found = value
-            if value.number in self._sums:
-                differs = self.scalar(lax.ne_p, (value, value), np.dtype(bool))  # never, but no compiler knows
-                found = self.scalar(lax.add_p, (value, self.converted(differs, value.dtype)), value.dtype)
-            elif getattr(value.operation, "name", None) in _KEEPS_SIGNED_ZEROS:
-                arguments = tuple(map(self._signed, value.arguments))
-                if any(one is not other for one, other in zip(arguments, value.arguments, strict=True)):
-                    found = self.scalar(value.operation, arguments, value.dtype, **value.parameters)
-            self._from_zero[value.number] = found
-        return self._from_zero[value.number]
+        known, stack = self._from_zero, [value] if isinstance(value, Node) else []
+        while stack:
+            node = stack[-1]
+            if node.number in known:
+                stack.pop()
+            elif node.number in self._sums:
+                differs = self.scalar(lax.ne_p, (node, node), np.dtype(bool))  # never, but no compiler knows
+                added = self.scalar(lax.add_p, (node, self.converted(differs, node.dtype)), node.dtype)
+                known[node.number] = known[added.number] = added
+            elif getattr(node.operation, "name", None) not in _KEEPS_SIGNED_ZEROS:
+                known[node.number] = node
+            elif left := [each for each in node.arguments if isinstance(each, Node) and each.number not in known]:
+                stack += left
+            else:
+                arguments = tuple(known[each.number] if isinstance(each, Node) else each for each in node.arguments)
+                found = node
+                if any(one is not other for one, other in zip(arguments, node.arguments, strict=True)):
+                    found = self.scalar(node.operation, arguments, node.dtype, **node.parameters)
+                known[node.number] = found
+        return known[value.number] if isinstance(value, Node) else value
 
     def converted(self, value: Any, dtype: Any) -> Any:
         """Return an entry as another type."""
@@ -207,7 +246,7 @@ class ScalarGraph:
             result = self.elementwise(primitive, [result, rows[..., at]], aval)
         if primitive is lax.add_p and rows.shape[-1] > 1 and aval.dtype.kind == "f":
             computed = (each for each in result.flat if isinstance(each, Node) and each.arguments)
-            self._sums.update(each.number for each in computed if _may_be_minus_zero(each))
+            self._sums.update(each.number for each in computed if self._may_be_minus_zero(each))
         return result
 
 
@@ -225,19 +264,6 @@ def filled(shape: tuple[int, ...], entries: Iterable[Any]) -> np.ndarray:
 
 def entries_of(arrays: Iterable[np.ndarray]) -> list[Any]:
     return [each for array in arrays for each in array.flat]
-
-
-def _may_be_minus_zero(value: Any) -> bool:
-    """Whether a sum or a term of it may be -0; squares are not, nor sums with them."""
-    if not isinstance(value, Node):
-        return bool(value == 0 and np.signbit(value))
-    match getattr(value.operation, "name", None):
-        case "add" | "add_any":
-            return all(map(_may_be_minus_zero, value.arguments))
-        case "mul":
-            return value.arguments[0] is not value.arguments[1]
-        case name:
-            return name not in ("abs", "square")
 
 
 def _identity(value: Any) -> Any:

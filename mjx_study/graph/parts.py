@@ -130,7 +130,7 @@ class _Parts:
             functions.append(
                 "\n".join(
                     [
-                        f"APART void part{place}(ARGUMENTS) {{ ENTER",
+                        f"PART void part{place}(ARGUMENTS) {{ ENTER",
                         *recalled,
                         *(each.text for each in part),
                         *(f"KEEP({kinds[at]}, {slots[at]}, x{at});" for at in changed),
@@ -141,7 +141,7 @@ class _Parts:
         driver = [
             line if isinstance(line, str) else f"if (!any(RECALL(mask, {slots[line]}))) break;" for line in self._driver
         ]
-        return [*functions, "\n".join(["PART void samples(ARGUMENTS) {", *driver, "}"])], size
+        return [*functions, "\n".join(["ALL_PARTS void samples(ARGUMENTS) {", *driver, "}"])], size
 
     def _slots(self) -> tuple[dict[int, int], int]:
         """Places in memory of the variables that several parts use, and their number; free ones are used again."""

@@ -19,7 +19,8 @@
 #define EACH _Pragma("GCC unroll 16") for (int lane = 0; lane < LANES; lane++)
 #define ONE static inline __attribute__((always_inline))  // inlined wherever it is used
 #define APART static __attribute__((noinline))
-#define PART static
+#define PART __attribute__((noinline, visibility("hidden")))
+#define ALL_PARTS static
 #define ARGUMENTS const char *const *in, const long *in_step, char *const *out, const long *out_step, char *kept, \
                   long step
 #define ENTER

@@ -27,7 +27,8 @@ typedef int mask;  // -1 or 0
 #define APART static __device__
 #define ENTER
 #endif
-#define PART static __device__
+#define PART APART
+#define ALL_PARTS static __device__
 #define ARGUMENTS const struct batch &batch, const long lane, char *kept, long step
 #define PASSED batch, lane, kept, step
 

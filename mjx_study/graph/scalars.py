@@ -17,14 +17,15 @@ import numpy as np
 from jax.core import Tracer
 
 from mjx_study.graph.function import MOST_KEPT, ScalarFunction, capture, is_input
-from mjx_study.graph.native import count_left, native_identity
+from mjx_study.graph.native import count_left, in_numpy, native_identity
 from mjx_study.graph.nodes import TooLargeError
 from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
-MOST_NATIVE: Final = 100_000
-"""Maximum number of scalar operations in native code; it takes compilers half a minute to two minutes."""
+MOST_NATIVE: Final = {"cpu": 1_000_000, "gpu": 100_000, "NumPy": 100_000}
+"""The same of native code. On CPUs, an operation on a vector takes about a cycle at any size, and compilers take two
+minutes of processor time for a million; a GPU runs 240,000 at two thirds of the speed of MJX's arrays."""
 
 _CAPTURED: Final[dict[Any, ScalarFunction | None]] = {}
 """Graphs, keyed by everything they depend on; None if too large."""
@@ -78,7 +79,9 @@ def _left() -> None:
 
 def most_scalars() -> int:
     """Maximum number of scalar operations here: `MOST_NATIVE`, or `MOST_SCALARS` without native code."""
-    return MOST_SCALARS[jax.default_backend()] if native_identity() is None else MOST_NATIVE
+    if native_identity() is None:
+        return MOST_SCALARS[jax.default_backend()]
+    return MOST_NATIVE["NumPy" if in_numpy() else jax.default_backend()]
 
 
 def _name(function: Any) -> Any:

@@ -18,7 +18,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from mjx_study.graph.c import NotWrittenError
-from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, run, scan_inputs
+from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, programs_in, run, scan_inputs
 from mjx_study.graph.native import POSTPONED, NativeFunction, count_left, native_identity, switched_on, written
 from mjx_study.graph.nodes import ScalarGraph, TooLargeError, constants
 from mjx_study.graph.scalars import most_scalars
@@ -27,6 +27,8 @@ MOST_OPERATIONS: Final = 4_000
 """Maximum number of scalar operations in a pass. Longer ones spend their time in the native code that they call, which
 programs share, and registers do not suffice for what surrounds it. On CPUs, code called in a loop that carries nothing
 does not count: only vectors of samples for which it has anything to do compute it."""
+MOST_CALLED: Final = 100_000
+"""Maximum number of scalar operations in a pass with those of code that it calls."""
 MOST_CARRIED: Final = 500
 """Maximum number of scalars from one pass to the next."""
 
@@ -171,7 +173,8 @@ def _body(
         fixed: whether each input is a constant.
         carried: places of what is carried, which it has in any case.
     """
-    most = MOST_OPERATIONS if len(carried) or jax.default_backend() != "cpu" else most_scalars()
+    calls = not len(carried) and jax.default_backend() == "cpu"
+    most = min(MOST_CALLED, most_scalars()) if calls else MOST_OPERATIONS
     graph = ScalarGraph(2 * most + sum(aval.size for aval in closed.in_avals), values_only=True)
     given = []
     for place, (each, known, aval) in enumerate(zip(inputs, fixed, closed.in_avals, strict=True)):
@@ -196,23 +199,15 @@ def _body(
     return function.of([free.index(place) for place in places]), places
 
 
-def _inside(equation: Any) -> list[Jaxpr]:
-    """Programs that an operation calls."""
-    found = []
-    for each in jax.tree.leaves(equation.params, is_leaf=lambda leaf: isinstance(leaf, ClosedJaxpr | Jaxpr)):
-        found += [each.jaxpr] if isinstance(each, ClosedJaxpr) else [each] if isinstance(each, Jaxpr) else []
-    return found
-
-
 def _has(jaxpr: Jaxpr, name: str) -> bool:
     """Whether a program has an operation, in programs that it calls, too."""
-    return any(each.primitive.name == name or any(_has(own, name) for own in _inside(each)) for each in jaxpr.eqns)
+    return any(each.primitive.name == name or any(_has(own, name) for own in programs_in(each)) for each in jaxpr.eqns)
 
 
 def _build(equation: Any) -> None:
     """Begin to build the native code that an operation calls, in the programs that it calls, too."""
     if equation.primitive.name == "native":
         equation.params["function"].begun()
-    for jaxpr in _inside(equation):
+    for jaxpr in programs_in(equation):
         for each in jaxpr.eqns:
             _build(each)
