@@ -16,10 +16,20 @@ import pytest
 
 from mjx_study.simulation import constraint, dynamics, patches
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.onset import corrected
 from mjx_study.simulation.scene import Scene, load_scene, put_scene
 
 # Budgets that leave MJX's solver to stop where its cost no longer falls: converged to rounding.
 OPTION: Final = 'tolerance="1e-30" iterations="100" ls_iterations="50"'
+
+
+def corrected_rollout(
+    scene: Scene, model: mjx.Model, start: dynamics.State, control_law: Any, horizon: int, **options: Any
+) -> tuple[dynamics.State, jax.Array, jax.Array, Any]:
+    """`dynamics.rollout` with the same values, but derivatives that include an onset term, and its counts."""
+    law = control_law, jnp.arange(horizon)
+    last, (states, controls, residuals, _), counts = corrected(scene, model, start, *law, lambda *_: None, **options)
+    return dynamics.trajectory(states, last), controls, residuals, counts
 
 
 def option(timestep: float = 0.002, extra: str = "", flag: str = "") -> str:

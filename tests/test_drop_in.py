@@ -19,7 +19,7 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
 from mjx_study.simulation.dynamics import initial_state
-from mjx_study.simulation.onset import check_onset, corrected_rollout
+from mjx_study.simulation.onset import check_onset
 from mjx_study.simulation.patches import patched
 from tests.scenes import (
     CASES,
@@ -27,6 +27,7 @@ from tests.scenes import (
     assert_close_by_rows,
     central_jacobian,
     compiled,
+    corrected_rollout,
     floor_scene,
     in_both_modes,
     option,

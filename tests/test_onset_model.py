@@ -13,14 +13,11 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import initial_state, rollout
-from mjx_study.simulation.onset import corrected, corrected_rollout
 from mjx_study.simulation.scene import Scene
-from mjx_study.simulation.shift import shifted
-from tests.scenes import FALLING, compiled, floor_scene, option, scene_of, slider
+from tests.scenes import FALLING, compiled, corrected_rollout, floor_scene, option, scene_of, slider
 from tests.test_onset_term import BOUNCING, LAW, Law
 
 ONSETS = {"step": "linear", "linear": "linear", "shift": "shift"}
-SIMULATED = {"linear": corrected, "shift": shifted}
 
 
 def last_state(path: str, onset: str, scene: Scene, model: mjx.Model, start: Any, steps: int) -> Any:
@@ -32,7 +29,7 @@ def last_state(path: str, onset: str, scene: Scene, model: mjx.Model, start: Any
     if onset == "none":
         states, *_ = rollout(scene, model, start, LAW, steps)
     else:
-        states, *_ = corrected_rollout(scene, model, start, LAW, steps, simulate=SIMULATED[onset])
+        states, *_ = corrected_rollout(scene, model, start, LAW, steps, onset=onset)
     return states.qpos[-1], states.qvel[-1]
 
 

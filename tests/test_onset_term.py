@@ -16,11 +16,9 @@ from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.results.findings import ERROR_PER_STRENGTH
 from mjx_study.simulation.contact import ContactModel, apply_contact, contact_model
 from mjx_study.simulation.dynamics import initial_state, rollout
-from mjx_study.simulation.onset import corrected, corrected_rollout
-from mjx_study.simulation.shift import shifted as by_shift
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
-from tests.scenes import DROP, floor_scene, option, run, scene_of
+from tests.scenes import DROP, corrected_rollout, floor_scene, option, run, scene_of
 
 TIMECONST, LOW, HIGH, WIDTH = 0.02, 0.9, 0.95, 0.001
 SPEED, GRAVITY = -1.7, -9.81
@@ -180,12 +178,12 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
         return found, (found, counts)
 
     def sample(*case):
-        def weighted(simulate):
-            kind = partial(last, simulate=simulate)
+        def weighted(onset):
+            kind = partial(last, onset=onset)
             return jax.vmap(lambda weight: mode(partial(kind, weight=weight), has_aux=True)(*case))(weights)
 
         weights = jnp.array([1.0, 0.0])
-        return weighted(corrected), weighted(by_shift)
+        return weighted("linear"), weighted("shift")
 
     batched = jax.vmap(jax.vmap(sample, in_axes=(0, None, None, None)))
     gaps, speeds, frees, laws = zip(*cases, strict=True)

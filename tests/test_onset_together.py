@@ -19,10 +19,9 @@ from mjx_study.simulation import constraint, guards, touch
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import advance_velocity, force_stage, initial_state, position_stage, rollout
-from mjx_study.simulation.onset import corrected_rollout, passages
-from mjx_study.simulation.shift import shifted
+from mjx_study.simulation.saltation import passages
 from mjx_study.simulation.touch import Crossings, Events, replaced_points
-from tests.scenes import floor_scene, option, run, scene_of
+from tests.scenes import corrected_rollout, floor_scene, option, run, scene_of
 from tests.test_onset_term import LAW
 
 CORNERS = 4
@@ -59,7 +58,7 @@ def falls(body: str, law: ContactModel, gaps: np.ndarray, by_steps: bool) -> np.
         if by_steps:
             return jnp.stack(jax.value_and_grad(drop_in)(gap)), None
         (value, found), of_linear = jax.value_and_grad(last, has_aux=True)(gap)
-        of_shift, also_found = jax.grad(partial(last, simulate=shifted), has_aux=True)(gap)
+        of_shift, also_found = jax.grad(partial(last, onset="shift"), has_aux=True)(gap)
         return jnp.stack([value, of_linear, of_shift]), jnp.stack([found, also_found])
 
     values, found = run(jax.vmap(sample), gaps)

@@ -15,8 +15,7 @@ from jax.ad_checkpoint import checkpoint_name
 from mjx_study.graph.derivative_rule import refusing, with_rule
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import State, rollout
-from mjx_study.simulation.onset import corrected_rollout
-from tests.scenes import FALLING, MECHANISM, compiled, floor_scene, option, scene_of, slider
+from tests.scenes import FALLING, MECHANISM, compiled, corrected_rollout, floor_scene, option, scene_of, slider
 
 STEPS = 5
 Function = Callable[[Any], Any]

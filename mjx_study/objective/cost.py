@@ -10,7 +10,6 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
 from mjx_study.simulation.dynamics import State, simulated, trajectory
 from mjx_study.simulation.onset import corrected
-from mjx_study.simulation.shift import shifted
 from mjx_study.simulation.touch import OnsetCounts
 from mjx_study.tasks.task import Task
 
@@ -29,8 +28,7 @@ def rollout_cost(
     Args:
         contact: None for the MJCF's own.
         start: the initial state, before the policy acts on it.
-        onset: "none", or "linear" or "shift" for a derivative with the onset term (see `mjx_study.simulation.onset` and
-            `mjx_study.simulation.shift`).
+        onset: "none", or "linear" or "shift" for a derivative with the onset term (see `mjx_study.simulation.onset`).
         weight: factor of the onset term; 0 for a derivative without it.
 
     Returns:
@@ -55,7 +53,7 @@ def rollout_cost(
     if onset == "none":
         last, found = simulated(*moved, backward)
     else:
-        last, found, counts = {"linear": corrected, "shift": shifted}[onset](*moved, weight=weight)
+        last, found, counts = corrected(*moved, onset, weight=weight)
     before, controls, residuals, costs = found
     cost = jnp.sum(costs) + final_cost(last)
     return cost, (trajectory(before, last), controls, jnp.max(residuals), counts)

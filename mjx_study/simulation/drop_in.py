@@ -22,8 +22,10 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qvel, State, fwd_position, with_solver
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.native_step import solved_natively
-from mjx_study.simulation.onset import Moving, differentiated_once, onset_term, tangent_of
+from mjx_study.simulation.observed import differentiated_once, tangent_of
+from mjx_study.simulation.over_model import Moving
 from mjx_study.simulation.patches import Place, patched
+from mjx_study.simulation.saltation import onset_term
 from mjx_study.simulation.touch import Events, crossings, onset_begins
 
 Replacements = dict[Place, Callable[..., mjx.Data]]

@@ -22,73 +22,46 @@ cost over a whole step, which this computes; that half of each difference looks 
 one of second order in the step over the spread. Since a whole step's shift is mapped to a whole step's shift whatever
 s, events at fixed intervals, whose s are not spread, are right, too, and the variance over s vanishes.
 
-Events of one step share a equally. A cell narrower than in `onset.least_travel` counts as that wide: only what a lacks
-is then taken too small. Bodies on several feet, each with noise of its own, have one a: there the term of
-`mjx_study.simulation.onset` has less variance.
+Events of one step share a equally. A cell narrower than in `observed.least_travel` counts as that wide: only what a
+lacks is then taken too small. Bodies on several feet, each with noise of its own, have one a: there the term of
+`mjx_study.simulation.saltation` has less variance.
 """
 
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation import guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
-from mjx_study.simulation.dynamics import (
-    ControlLaw,
-    Controls,
-    Qpos,
-    RunningCost,
-    State,
-    entry_by_entry,
-    fwd_position,
-    simulated,
-)
+from mjx_study.simulation.dynamics import Control, Controls, Qpos, State, entry_by_entry, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import (
-    acting,
+from mjx_study.simulation.observed import (
+    Known,
+    Observed,
+    Replay,
     along_events,
     guard_at,
     known_step,
     least_travel,
     moving_values,
-    observed_rollout,
     over_events,
-    slots_for,
     tangent_of,
     timestep_of,
-    without_derivative,
 )
 from mjx_study.simulation.over_model import moved_by_model
 from mjx_study.simulation.scene import Scene
-from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, events_of
+from mjx_study.simulation.touch import Events, OnsetCounts, at_touch
 
 
-def shifted(
-    scene: Scene,
-    model: mjx.Model,
-    start: State,
-    control_law: ControlLaw,
-    inputs: Any,
-    running_cost: RunningCost,
-    slots: int | None = None,
-    weight: float | Scalar = 1.0,
-) -> tuple[State, tuple[State, Controls, Float[Array, " horizon"], Any], OnsetCounts]:
-    """`dynamics.simulated` with the same values, but derivatives that include the onset term by shifts in time.
-
-    Arguments, results and derivatives are those of `onset.corrected`, but for twice its slots, which cost little here.
-    """
-    if not guards.num_guards(scene.template):
-        found = simulated(scene, model, start, control_law, inputs, running_cost)
-        return *found, OnsetCounts.none(start.qpos.dtype)
-    fixed_model, timestep = without_derivative(model), timestep_of(scene, model)
-    step_length, acted = timestep_of(scene, fixed_model), acting(control_law, running_cost)
-    last, past, known = observed_rollout(scene, fixed_model, start, acted, inputs)
-    before, controls, after, residuals, costs, found = known
-    events = events_of(found, 2 * slots_for(scene, len(controls)) if slots is None else slots)
+def shifts(
+    scene: Scene, model: mjx.Model, fixed_model: mjx.Model, seen: Observed, events: Events, weight: float | Scalar
+) -> tuple[Replay, Scalar, Any, OnsetCounts]:
+    """What `onset.corrected` needs of this term, as `saltation.saltation`; a is passed from step to step."""
+    timestep, step_length = timestep_of(scene, model), timestep_of(scene, fixed_model)
+    before, controls, after, found = seen.before, seen.controls, seen.after, seen.found
     crossings = over_events(partial(_crossing_of, scene, fixed_model, before, after), events)
     cells = _cells(crossings, events, before.qvel, step_length)
     over_velocity = (1 - cells.since)[:, None] * crossings.normal
@@ -96,11 +69,8 @@ def shifted(
     by_model = cells.rate * moved_by_model(scene, model, before, events)
     by_model = jnp.zeros(len(controls), by_model.dtype).at[events.step - 1].add(by_model)
 
-    def follow(carry: tuple[State, Scalar], known: Any):
-        state, earlier = carry
-        given, fixed, values, after, own, of_model, near = known
-        state = moving_values(fixed, state)
-        control, cost = moving_values(values, acted(given, state))
+    def replay(state: State, earlier: Scalar, control: Control, known: Known, row: Any) -> tuple[State, Scalar]:
+        (fixed, given, after), (own, of_model, near) = known, row
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
         moved = jnp.concatenate([moved, timestep * state.qvel - step_length * fixed.qvel, earlier[None]])
         (change,) = tangent_of(along_events(cells.rate[:, None], slopes, own, moved))
@@ -116,21 +86,19 @@ def shifted(
             integrate_position(scene.host, state.qpos, way, 1.0),
             state.qvel - along(near.qvel, fixed.qvel, after.qvel),
             state.act - along(near.act, fixed.act, after.act),
-            control - along(near.control, values[0], near.next_control),
+            control - along(near.control, given, near.next_control),
         )
-        point = moving_values((fixed.qpos, fixed.qvel, fixed.act, values[0]), rest)
+        point = moving_values((fixed.qpos, fixed.qvel, fixed.act, given), rest)
         qvel, act = known_step(scene, model, point, after)
         qvel = qvel + along(fixed.qvel, after.qvel, near.next_qvel)
         act = act + along(fixed.act, after.act, near.next_act)
-        following = State(integrate_position(scene.host, state.qpos, qvel, timestep), qvel, act, after.warmstart)
-        return (following, shift), (state, control, cost)
+        return State(integrate_position(scene.host, state.qpos, qvel, timestep), qvel, act, after.warmstart), shift
 
     own = tuple(jnp.append(jnp.minimum(each[1:], len(events.used)), 0) for each in (found.before, found.after))
-    known = inputs, before, (controls, costs), after, own, by_model, _neighbours(before, after, controls)
-    none = jnp.zeros((), cells.rate.dtype)
-    (moving, _), (states, controls, costs) = jax.lax.scan(follow, (start, none), known)
-    counts = events.counts(past, cells.valid, cells.narrow, jnp.zeros_like(cells.rate), jnp.zeros_like(cells.valid))
-    return moving_values(last, moving), (states, controls, residuals, costs), counts
+    rows = own, by_model, _neighbours(before, after, controls)
+    nothing = jnp.zeros_like(cells.rate)
+    counts = events.counts(seen.past, cells.valid, cells.narrow, nothing, nothing > 0)
+    return replay, jnp.zeros((), cells.rate.dtype), rows, counts
 
 
 class Neighbours(NamedTuple):

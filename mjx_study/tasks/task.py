@@ -124,7 +124,7 @@ class Task:
             `analytic` adds the task's noise.
         noise: name of the noise density in `estimators.NOISES`.
         onset: treatment of the onset of contact in first-order gradients: "none" for exact derivatives of the steps, or
-            "linear" or "shift" to add what those miss (see `mjx_study.simulation.onset` and `.shift`).
+            "linear" or "shift" to add what those miss (see `mjx_study.simulation.onset`).
         metrics: function that computes named metrics of a rollout, reported along with the cost, from its states
             including the initial one, (horizon + 1, ...), likewise; None for none.
         defaults: defaults for studies of the task.
