@@ -163,6 +163,7 @@ def main() -> None:
         command = "experiments.robots", name, "--routes", route, "--here", *settings
         keep({"robot": name, "route": route}, command, "1" if route == "native" else "xla", MOST_SECONDS, given.into)
     if given.into == RESULTS:
+        mjx_study.configure()
         write_page()
 
 

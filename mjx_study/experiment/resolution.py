@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import ESTIMATORS, ORACLES, Estimator, find_estimator, make_estimator
+from estimators.registry import label_of
 from mjx_study.choices import REFERENCE, takes_stiffness
 from mjx_study.options.configuration import ESTIMATOR_OPTIONS, SCENE_OPTIONS, StudyConfig
 from mjx_study.options.option import OptionError, check_span, reject_unused
@@ -204,11 +205,13 @@ def reject_unused_options(
         (["backward_stiffness"], takes_stiffness(surrogates), "has no effect: no surrogate family takes one"),
         (SCENE_OPTIONS, bool(simulated), "has no effect: nothing is simulated"),
     )
+    known = dict[str, str]()
     for each in map(find_estimator, config.estimators):
-        if CORRECTED in each.needs and not simulated:
-            raise ValueError(
-                f"{each.name} corrects gradients through simulated contact, and nothing is simulated: omit it"
-            )
+        if CORRECTED in each.needs and not touching:
+            raise ValueError(f"{each.name} corrects gradients through contact, and nothing simulated has any: omit it")
+        label = label_of(each.name, config.onset) if config.onset != "none" and each.name in ESTIMATORS else each.name
+        if (other := known.setdefault(label, each.name)) != each.name:
+            raise OptionError("onset", f"makes {other} and {each.name} the same: omit one of the three")
 
 
 def _fields(estimator: type[Estimator]) -> set[str]:
