@@ -200,7 +200,7 @@ def test_what_is_not_solved_natively_is_left_to_mjx(monkeypatch: pytest.MonkeyPa
     if why == "switch":
         monkeypatch.setenv(SWITCH, "xla")
     if why == "size":
-        monkeypatch.setitem(scalars.MOST_NATIVE, "cpu", 5000)
+        monkeypatch.setattr(scalars, "MOST_NATIVE", dict.fromkeys(scalars.MOST_NATIVE, 5000))
     one = lambda data, model=scene.model: step(model, data).qpos  # noqa: E731
     program = jax.make_jaxpr(one)(scene.template, *([scene.model] if why == "model" else []))
     assert "native[" not in str(program) and "while[" in str(program)

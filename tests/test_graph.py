@@ -241,11 +241,12 @@ def _one_term(x):
     "function",
     [
         lambda x: jnp.minimum(1 / (0.5 * _one_term(x)), 1e6),
+        lambda x: jnp.minimum(1 / jnp.sum(x * jnp.array([2.0, 3.0])), 1e6),
         lambda x: jnp.arctan2(jnp.zeros(3).at[0].set(-1.0) @ jnp.stack([x, x, x]), -1.0 - x),
         lambda x: jax.lax.integer_pow(jnp.where(x < 1, _one_term(x), 2.0), -3),
         lambda x: jax.lax.rsqrt(_one_term(x)),
     ],
-    ids=["quotient", "angle", "power", "root"],
+    ids=["quotient", "products", "angle", "power", "root"],
 )
 def test_a_sum_of_zeros_is_not_negative(function, native, monkeypatch):
     monkeypatch.setenv(SWITCH, native)
@@ -258,7 +259,7 @@ def test_a_sum_of_zeros_is_not_negative(function, native, monkeypatch):
 def test_values_alone_can_be_too_large(monkeypatch):
     """A call with its own derivative is one operation, unless only values are wanted."""
     monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", 9)
-    monkeypatch.setitem(scalars.MOST_NATIVE, "cpu", 9)
+    monkeypatch.setattr(scalars, "MOST_NATIVE", dict.fromkeys(scalars.MOST_NATIVE, 9))
 
     @jax.custom_jvp
     def long(x):
@@ -297,7 +298,7 @@ def test_what_is_far_too_large_is_refused_before_it_is_written_out():
 @pytest.mark.parametrize("most", [3, 11])
 def test_what_is_too_large_is_left_as_it_is(monkeypatch, most):
     monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", most)
-    monkeypatch.setitem(scalars.MOST_NATIVE, "cpu", most)
+    monkeypatch.setattr(scalars, "MOST_NATIVE", dict.fromkeys(scalars.MOST_NATIVE, most))
     function = lambda x: jnp.outer(x, x) @ jnp.cos(x)  # noqa: E731
     assert _operations(lambda x: unrolled(function, x), ROW) == _operations(function, ROW)
 

@@ -49,6 +49,7 @@ LAWS = "tests/test_constraint.py::test_forces_and_imbalance_are_those_of_mjx"
 IMPEDANCE = "tests/test_patches.py::test_stiffness_damping_and_impedance_are_the_c_engines"
 CONE = "tests/test_constraint.py::test_the_elliptic_law_is_the_gradient_of_a_convex_cost"
 UNBIASED, VARIANCES = "tests/estimators/test_unbiasedness.py", "tests/estimators/test_variances.py"
+TERM, FORMULA = "tests/test_onset_term.py", "test_every_sample_is_that_of_the_formula"
 STEPWISE, CHOICE = "tests/estimators/test_stepwise.py", "tests/estimators/test_interpolation.py"
 
 # Of each: name, file; the old text; the new one; how somebody comes to write it, which tests see it, and the model.
@@ -93,6 +94,39 @@ DEFECTS: Final[tuple[Defect, ...]] = (
            "return which, bool(case)", "return which, not case",
            "the cases of a selection in the order of `where`, which is the other one",
            (f"{GRAPHS}::test_what_a_selection_leaves_out_does_not_count_in_reverse_mode",), "slider"),
+    Defect("none-of-several", "mjx_study/graph/differentiation.py",
+           "(*shared, (some, True)) if isinstance(some, Node) else shared", "shared",
+           "a sum of cases counts where none of them is taken, and 0 times an infinite derivative is NaN",
+           (f"{GRAPHS}::test_what_a_selection_leaves_out_does_not_count_in_reverse_mode",)),
+    Defect("kept-until-its-last-line", "mjx_study/graph/parts.py",
+           "last[at] = max(last[at], end)", "pass",
+           "a place in memory is used again within a loop whose next pass still needs it",
+           ("tests/test_native.py::test_long_functions_are_divided",)),
+    Defect("minus-zero-of-sums", "mjx_study/graph/nodes.py",
+           'or (name == "mul" and arguments[0] is arguments[1])', 'or name == "mul"',
+           "products are taken for squares, and a sum of them is -0 where JAX has 0",
+           ("tests/test_graph.py::test_a_sum_of_zeros_is_not_negative",)),
+    Defect("onset-weights-swapped", "mjx_study/simulation/saltation.py",
+           "Terms(last * jump / cell, earlier * jump / cell", "Terms(earlier * jump / cell, last * jump / cell",
+           "which of both neighbours is nearer", (f"{TERM}::{FORMULA}[jacrev]",)),
+    Defect("onset-speed-of-the-step-after", "mjx_study/simulation/saltation.py",
+           "moved - timestep * state.qvel) + earlier", "moved) + earlier",
+           "the second jump along the position at step k, not at k - 1", (f"{TERM}::{FORMULA}[jacrev]",)),
+    Defect("shift-all-ahead", "mjx_study/simulation/shift.py",
+           "weight * near.ahead * shift / 2, weight * earlier / 2", "weight * near.ahead * shift, 0 * earlier",
+           "one-sided differences, whose error is of first order", (f"{TERM}::{FORMULA}[jacrev]",)),
+    Defect("shift-at-the-end-of-the-step", "mjx_study/simulation/shift.py",
+           "over_velocity = (1 - cells.since)[:, None]", "over_velocity = cells.since[:, None]",
+           "the share of a step since the touch for that before it", (f"{TERM}::{FORMULA}[jacrev]",)),
+    Defect("events-of-a-step-in-full", "mjx_study/simulation/shift.py",
+           "1 / (jnp.maximum(number, 1) * width)", "1 / width",
+           "several events of a step each shift the whole rollout",
+           ("tests/test_onset_together.py::test_four_corners_have_the_derivatives_of_one_contact",)),
+    Defect("ties-begin-together", "mjx_study/simulation/touch.py",
+           "(self.since == own) & (index < guard)", "(self.since == own)",
+           "each of several contacts that begin at once finds the others there already",
+           ("tests/test_onset_together.py::test_jumps_of_a_step_add_up_whatever_their_order",
+            "tests/test_onset_together.py::test_four_corners_have_the_derivatives_of_one_contact")),
     Defect("always-euler", "mjx_study/simulation/dynamics.py",
            "mjx.implicit(model, data) if implicit else mjx.euler(model, data)",
            "mjx.euler(model, data)",
