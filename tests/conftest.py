@@ -121,6 +121,14 @@ def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator
 
 
 @pytest.fixture
+def natively(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Native code, also where all tests run without."""
+    from mjx_study.graph.native import SWITCH  # not above, for the same reason
+
+    monkeypatch.delenv(SWITCH, raising=False)
+
+
+@pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells of gradients take no time, and their numbers are NaN."""
     from tests.documents import planned_arrays, stub_cells  # not above, for the same reason

@@ -63,7 +63,7 @@ def builds_of(folder: Path, *commands: str) -> list[dict[str, list[str]]]:
 def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
     """The second command is another one, on the same task, with other samples and seeds.
 
-    Through XLA, other numbers of samples are other chunks, which are other programs.
+    Through XLA and in NumPy, other numbers of samples are other chunks, which are other programs.
     """
     (tmp_path / "mine.py").write_text("from tests.carts import cart\n")
     compare = "compare mine:cart --contact mjcf --samples 20 --reference-samples 20"
@@ -78,7 +78,7 @@ def test_studies_of_an_own_task_build_nothing_twice(tmp_path: Path) -> None:
         large = [name for name in found["built"] if name in LARGE]
         descents_of_three_estimators = 2 * ("descent" in large)
         assert len(large) == len(set(large)) + descents_of_three_estimators, large
-    native = computes_steps() != "XLA"
+    native = computes_steps() == "native"
     assert again["built"] == later["built"] == [] and (not native or others["built"] == more["built"] == [])
     assert first["traced"] and descents["traced"]
     for found in (again, later, *((others, line, more) if native else ())):

@@ -173,6 +173,7 @@ def test_samples_fill_whole_calls_within_the_budget() -> None:
     assert affordable(0.25, 8) == 4 * 3 * 8 - 1
 
 
+@pytest.mark.usefixtures("natively")
 def test_calls_of_large_models_are_short() -> None:
     """A call computes all of its samples, so that one of many would take minutes where few are asked for."""
     quadruped = Path(mujoco.__file__).parent / "mjx" / "test_data" / "barkour_v0" / "assets" / "barkour_v0_mjx.xml"

@@ -114,6 +114,7 @@ def test_shifts(kind):
     compare(shifts, np.array([0, 1, 77, most // 3, most - 1, most], kind), exact=True)
 
 
+@pytest.mark.usefixtures("natively")
 @pytest.mark.parametrize("size", [1, 6, 35, 400])
 def test_normal_random_numbers(size):
     """Of the same keys as JAX's, to the rounding of XLA's polynomial, and the same in every batch."""
@@ -272,7 +273,7 @@ print(jax.jit(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
     [({"PATH": "/nowhere"}, 1, False), ({SWITCH: "0"}, 0, False), ({SWITCH: "xla"}, 0, True)],
 )
 def test_without_a_compiler(setting, lines, in_xla):
-    environment = {key: value for key, value in os.environ.items() if key != "CC"} | setting
+    environment = {key: value for key, value in os.environ.items() if key not in ("CC", SWITCH)} | setting
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment)
     assert done.stdout.splitlines()[-1] == "[2. 2. 2.]" and ("native" not in done.stdout) == in_xla
     assert done.stderr.count("mjx-study: no C compiler found: steps run more slowly, on CPUs in NumPy") == lines

@@ -105,6 +105,7 @@ def test_a_chunk_of_gradients_fits_into_an_accelerators_memory(simulator):
     assert 0.2 * 2**28 < chunk(1) * planned < 2 * 2**28
 
 
+@pytest.mark.usefixtures("natively")
 @pytest.mark.parametrize(
     ("samples", "chunk"), [(1, 11), (10, 11), (11, 101), (100, 101), (400, 101), (1999, 101), (10**6, 201)]
 )
