@@ -407,7 +407,7 @@ def test_a_mean_that_is_not_judged_is_not_called_biased(found: Diagnosis) -> Non
     unsure = with_estimator(found, name, **off, verdict="undecided")
     best = advised(found, estimators=unsure)[0]
     assert "its bias" not in best and f"take {name};" in best
-    assert best.endswith("whether its mean is right is undecided: it is off by 30 ± 20 % along the paths")
+    assert best.endswith("whether its mean is right is undecided: 30 ± 20 % off along the paths")
 
 
 def test_cautions_of_derivatives_and_stability(found: Diagnosis) -> None:

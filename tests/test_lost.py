@@ -141,8 +141,8 @@ def test_lost_samples_are_told_by_contact_model_and_estimator() -> None:
     variance = along("model", 1.0, 1e138, 2.0)
     first, second = lost_samples(study("gradients", models, nonfinite=lost, variance=variance))
     assert first == (
-        "42 samples overflowed or became NaN and were left out: penalty, K = 100000 N/m (FoBG 20, AoBG 20); "
-        "mujoco_default (FoBG 1, AoBG 1)"
+        "42 samples overflowed or became NaN and were left out, so that the rest are not random: "
+        "penalty, K = 100000 N/m (FoBG 20, AoBG 20); mujoco_default (FoBG 1, AoBG 1)"
     )
     assert second.startswith("penalty, K = 100000 N/m: the motion explodes (numbers up to 1e+138)")
     assert lost_samples(study("gradients", models, nonfinite=0.0)) == []

@@ -273,7 +273,7 @@ def as_json(dataset: xr.Dataset) -> dict[str, Any]:
 
 def test_warnings_name_what_must_not_be_overlooked() -> None:
     told = warnings_of(result(row("fobg", 10, 1, nonfinite=7), row("zobg", 10, 1, unconverged=3, residual=0.2)))
-    assert any(line.startswith("7 samples overflowed or became NaN and were left out: ") for line in told)
+    assert any(line.startswith("7 samples overflowed or became NaN and were left out, ") for line in told)
     assert "3 rollouts in which the contact solver did not converge" in told
 
 

@@ -21,7 +21,8 @@ Advice = tuple[str, str]
 def cautions(found: Diagnosis) -> Iterator[str]:
     """Caveats about the numbers on the page."""
     if found.lost:
-        yield f"{found.lost} samples are not finite and were left out: try a smaller --timestep or --sigma"
+        remedy = "see below" if found.derivatives.failure == "nan" else "try a smaller --timestep or --sigma"
+        yield f"{found.lost} samples are not finite and were left out: {remedy}"
     if found.unconverged:
         yield (
             f"in {found.unconverged} rollouts the contact solver did not converge: their derivatives are not those "
@@ -37,7 +38,7 @@ def cautions(found: Diagnosis) -> Iterator[str]:
     if found.best.verdict == "undecided" and found.resolved:
         yield f"{found.samples} samples do not decide if the mean of {found.best.estimator} is right: {_more(found)}"
     if not found.derivatives.passed:
-        yield "derivatives of a step are not right (see below): do not trust a first-order estimate"
+        yield "derivatives are not right (see below): do not trust a first-order estimate"
 
 
 def advise(found: Diagnosis) -> Iterator[Advice]:
@@ -95,7 +96,7 @@ def _best(found: Diagnosis) -> Advice:
         many = round_up(found.samples_needed)
         needed = f"; a relative error of {percent(TARGET_ERROR)} needs {many} sample{'' if many == '1' else 's'}"
     if best.verdict == "undecided":
-        needed += f"; whether its mean is right is undecided: it is off by {bias} along the paths"
+        needed += f"; whether its mean is right is undecided: {bias} off along the paths"
     elif not needed:
         needed = f"; its bias of {bias} remains, however many samples"
     elif best.verdict == "biased":

@@ -36,6 +36,7 @@ HALF_LENGTH: Final = 2.0  # length of the path to either side of theta, in stand
 FEEDBACK: Final = 0.02  # the same for noise on the controls, in the unit of theta
 ALONG_MEANS: Final = "means"  # value of `direction` for paths along the estimators' means, see `along_means`
 MAX_PATHS: Final = 3
+UNRESOLVED: Final = 10.0  # uncertainty of a difference, in slopes, above which its size is not told
 MIN_SHARE: Final = 1e-3  # smallest share of a mean orthogonal to the others that warrants a path along it
 
 Nodes = Callable[[int, int], None]
@@ -241,6 +242,8 @@ def term_lines(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
         more = "; more --samples decide it" if check.verdict == "undecided" else ""
         gap, half = row["relative_gap"], (row["detectable"] or 0.0) / 2
         found = "the mean cost is flat" if gap is None else f"{percent(abs(gap), 2)} ± {percent(half, 2)} off"
+        if half > UNRESOLVED:
+            found, more = f"its samples vary too much to tell, ± {half:.0e} times the slope", ""
         lines.append(
             f"{where}: the mean of {name} is {check.verdict}: {found} along its path, without a reference{more}."
         )

@@ -13,7 +13,6 @@ from mjx_study.diagnose.columns import CONTACTS, DISTANCE, ESTIMATES, TOUCHES
 from mjx_study.diagnose.means import ALONG_MEANS
 from mjx_study.diagnose.measurement import RESOLVED_SE, Measured
 from mjx_study.diagnose.run import Diagnosis, enough
-from mjx_study.gradcheck.diagnosis import MEANING
 from mjx_study.runtime import environment
 from mjx_study.table import Column, as_plain, percent, tabulate, with_error
 
@@ -40,7 +39,7 @@ def document_of(found: Diagnosis) -> dict[str, Any]:
         **found.onsets,
         "nonfinite": found.lost,
         "unconverged": found.unconverged,
-        "derivatives": "right" if found.derivatives.passed else found.failure,
+        "derivatives": "right" if found.derivatives.passed else found.derivatives.failure,
         "unexercised": found.derivatives.unexercised,
         "estimators": [
             {
@@ -102,14 +101,14 @@ def page_lines(found: Diagnosis) -> list[str]:
 
 def _derivatives(found: Diagnosis) -> str:
     if not found.derivatives.passed:
-        return f"NOT RIGHT: {MEANING[found.failure]}"
+        return f"NOT RIGHT: {found.derivatives.reason}"
     parts = dict.fromkeys(part for parts in found.derivatives.unexercised.values() for part in parts)
     return "; not exercised: ".join(["every derivative that exists is right", *([", ".join(parts)] if parts else [])])
 
 
 def _contact_lines(found: Diagnosis) -> list[str]:
     onsets = found.onsets.get("onsets", 0)
-    lines = [f"  contacts and limits that begin in a rollout with noise: {onsets / found.samples:.2g}"]
+    lines = [f"  contacts and limits that begin in a rollout with noise: {onsets / found.samples:.3g}"]
     if found.law:
         before = f" a contact begins {1e3 * found.lead:.3g} ms before touch, where it acts;" if found.lead else ""
         lines.insert(0, f"  {found.law} is not MuJoCo's law:{before} onset terms and impedance do not apply")
@@ -123,7 +122,7 @@ def _contact_lines(found: Diagnosis) -> list[str]:
             ("replaced", "corners or edges replace others"),
         ):
             if count := found.onsets.get(f"onsets_{name}", 0):
-                lines.append(f"  per rollout, left uncorrected ({what}): {count / found.samples:.2g}")
+                lines.append(f"  per rollout, without a term ({what}): {count / found.samples:.3g}")
     if not found.touches:
         return [*lines, "  contacts that begin in the rollout without noise: 0"]
     worst = sorted(found.touches, key=lambda each: (each.stable, -each.jump, -(each.travel or each.speed)))

@@ -47,10 +47,6 @@ class Diagnosis(Measurement):
     options: str
 
     @property
-    def failure(self) -> str:
-        return next((finding.verdict for finding in self.derivatives.findings if finding.fails), "wrong")
-
-    @property
     def scale_error(self) -> float:
         return self.norm_error / self.norm if self.resolved else 0.0
 

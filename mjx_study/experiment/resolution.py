@@ -199,7 +199,7 @@ def reject_unused_options(
         (
             ["onset"],
             touching and (first_order or reads_onset(config.estimators, config.onset)),
-            f"{FIRST_ORDER} (estimators named _onset have a term anyway)",
+            f"{FIRST_ORDER}{' (estimators named _onset have a term anyway)' if touching else ''}",
         ),
         (["backward"], touching and (first_order or reads_onset(config.estimators)), FIRST_ORDER),
         (["backward_stiffness"], takes_stiffness(surrogates), "has no effect: no surrogate family takes one"),

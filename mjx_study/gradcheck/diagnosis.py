@@ -36,6 +36,12 @@ MEANING: Final = {
     "engine_mismatch": "the step of MJX differs from that of the C engine as documented (docs/gradient-faults.md)",
     "apart": "the analytic counterpart is another model of the same system, approached as contact stiffens",
 }
+OF_WHOLE: Final = {
+    "nan": "not a number: cost or policy has a function of infinite derivative, such as a square root at 0, perhaps in "
+    "the branch of a jnp.where that is not taken",
+    "unconverged": "of another point, because the solver stopped early",
+}
+"""What may be wrong with the gradient of a whole cost whose steps are right."""
 Codes = Int[np.ndarray, "outputs inputs"]
 
 

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, Final
 
 from mjx_study.gradcheck.coverage import Coverage
-from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
+from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, OF_WHOLE, VERDICTS
 from mjx_study.table import Column, as_plain, grouped, tabulate
 
 MAX_SHOWN: Final = 12  # maximum number of findings in the text, unless all are requested
@@ -208,6 +208,23 @@ class GradcheckReport:
         return not any(verdict in FAILURES for verdict in verdicts) and not any(f.fails for f in self.findings)
 
     @property
+    def failure(self) -> str:
+        """The first verdict that fails; empty if none does."""
+        verdicts = [each.verdict for each in self.findings if each.fails]
+        verdicts += [check.verdict for check in (*self.steps, *self.costs) if check.verdict in FAILURES]
+        return next(iter(verdicts), "")
+
+    @property
+    def reason(self) -> str:
+        """What is wrong; empty if nothing is."""
+        if any(each.fails for each in self.findings) or any(check.verdict in FAILURES for check in self.steps):
+            return MEANING[self.failure]
+        what = OF_WHOLE.get(self.failure, "not its slope: look at the derivatives of cost and policy")
+        return (
+            f"the derivatives of steps are right, but the gradient of the whole cost is {what}" if self.failure else ""
+        )
+
+    @property
     def unexercised(self) -> dict[str, tuple[str, ...]]:
         """Parts of the model that no state exercised, by contact model."""
         return {check.label: check.coverage.missing for check in self.steps if check.coverage.missing}
@@ -222,7 +239,9 @@ class GradcheckReport:
         if self.costs:
             lines += ["gradient of the whole cost", *_table(self.costs, OF_COST)]
             if any(check.gradient_norm == 0 for check in self.costs):
-                lines.append("|gradient| 0: the parameters do not affect the cost here, so that nothing is checked")
+                lines.append(
+                    "|gradient| 0: the cost has no slope here, so that nothing is checked; try another --theta"
+                )
             lines.append("")
         lines += ["one step", *_table(self.steps, OF_STEP)]
         if any(check.unresolved for check in self.steps):
@@ -234,7 +253,8 @@ class GradcheckReport:
         lines += self._coverage_lines()
         lines += self._finding_lines(verbose)
         lines += [f"warning: {text}" for text in (*self.warnings, *self._gaps())]
-        verdict = "every derivative that exists is right" if self.passed else "SOMETHING IS WRONG: see above"
+        told = "see above" if any(each.fails for each in self.findings) else self.reason
+        verdict = "every derivative that exists is right" if self.passed else f"SOMETHING IS WRONG: {told}"
         return [*lines, f"{verdict}, where it was checked" if self.passed and self.unexercised else verdict]
 
     def _coverage_lines(self) -> list[str]:
@@ -247,7 +267,7 @@ class GradcheckReport:
         unexercised = self.unexercised
         return [
             f"{', '.join(labels)}: no state exercises {' and '.join(missing)}, whose derivatives are unchecked; try "
-            "more --states, a longer --horizon, another --seed or an MJCF whose first keyframe is closer to it"
+            "more --states, a longer --horizon, another --seed or an MJCF whose first keyframe does"
             for missing, labels in grouped(unexercised, unexercised.__getitem__).items()
         ]
 

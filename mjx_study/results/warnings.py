@@ -29,7 +29,10 @@ def lost_samples(dataset: xr.Dataset) -> list[str]:
             told.append(f"{_name(dataset, index)} ({shares})")
         more = np.count_nonzero(by_model) - len(told)
         told += [f"{more} more contact models"] if more else []
-        messages.append(f"{total(counts)} samples overflowed or became NaN and were left out: {'; '.join(told)}")
+        messages.append(
+            f"{total(counts)} samples overflowed or became NaN and were left out, so that the rest are not random: "
+            f"{'; '.join(told)}"
+        )
     largest = np.max([_per_model(dataset[name], "max") for name in SIZES if name in dataset], axis=0, initial=0.0)
     for index in np.flatnonzero(largest > EXPLODED)[:MOST_NAMED].tolist():
         messages.append(
@@ -80,7 +83,7 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
     found += [f"{count} {counted[name]}" for name, count in counts.items() if count]
     if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
         found.append(
-            f"{few} batches rest on fewer than {ENOUGH_EFFECTIVE:g} effective samples: do not trust their errors, "
+            f"fewer than {ENOUGH_EFFECTIVE:g} effective samples in batches: {few}; do not trust their errors, "
             "p-values and variances (marked ? in the table of compare, effective_samples in the data)"
         )
     if "stopped_at" in dataset and (stopped := int(dataset["stopped_at"].notnull().sum())):

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 from mjx_study import cli
@@ -47,6 +48,17 @@ def test_the_pusher_is_right(capsys: pytest.CaptureFixture[str]) -> None:
         assert step["modes"] < 1e-10 and step["differences"] < 1e-6 and step["parameters"] < 1e-6
         assert step["stock_step"] < 1e-6 and step["engine_step"] < 1e-8 and step["engine"] < 1e-5
         assert step["coverage"]["counts"]["push"] and step["coverage"]["missing"] == []
+
+
+def test_a_gradient_that_is_no_number_is_told_from_a_wrong_step() -> None:
+    """Of a cost with a square root at 0, in the branch that is not taken."""
+    task = make_task("pusher").replace(horizon=3)
+    kinky = lambda state, control: jnp.where(control[0] > 5, jnp.sqrt(control[0] - 5), 0 * state.qpos[0])  # noqa: E731
+    report = gradcheck(plan_gradcheck(task.replace(running_cost=kinky), ["mujoco_default"], None, seed=0, states=1))
+    assert [check.verdict for check in report.costs] == ["nan"] and not any(each.fails for each in report.findings)
+    assert not report.passed and report.failure == "nan"
+    assert report.lines()[-1].startswith("SOMETHING IS WRONG: the derivatives of steps are right, but")
+    assert "cost or policy" in report.reason
 
 
 def test_a_wrong_derivative_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
