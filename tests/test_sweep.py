@@ -256,5 +256,5 @@ def test_a_study_warns_of_batches_that_are_too_small_to_tell(undisturbed: Path) 
     few = enough.assign(effective_samples=enough["effective_samples"].where(enough["seed"] > 0, 2.9))
     (message,) = [message for message in warnings_of(few) if "effective samples" in message]
     batches = few["effective_samples"].size // few.sizes["seed"]
-    assert message.startswith(f"{batches} batches rest on fewer than 3 effective samples")
+    assert message.startswith(f"fewer than 3 effective samples in batches: {batches};")
     assert "marked ? in the table of compare" in message
