@@ -243,9 +243,10 @@ def term_lines(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
         gap, half = row["relative_gap"], (row["detectable"] or 0.0) / 2
         found = "the mean cost is flat" if gap is None else f"{percent(abs(gap), 2)} ± {percent(half, 2)} off"
         if half > UNRESOLVED:
-            found, more = f"its samples vary too much to tell, ± {half:.0e} times the slope", ""
+            found, more = f"its samples vary too much, ± {half:.0e} times the slope", ""
         lines.append(
-            f"{where}: the mean of {name} is {check.verdict}: {found} along its path, without a reference{more}."
+            f"{where}: the mean of {name} is {check.verdict}, on average along its path: {found}, without a "
+            f"reference{more}."
         )
     return lines
 
