@@ -22,7 +22,7 @@ from experiments.starts import task_of_start
 from mjx_study.objective import Simulator
 from mjx_study.objective.programs import SamplePrograms
 from mjx_study.runtime import configure
-from mjx_study.simulation import onset, shift, touch
+from mjx_study.simulation import onset, touch
 from mjx_study.simulation.contact import ContactModel, family_model
 from mjx_study.simulation.dynamics import State
 from mjx_study.table import markdown_table
@@ -76,8 +76,7 @@ def gradients(task: Task, contact: ContactModel | None, samples: int, chunk: int
 
         with (
             mock.patch.object(touch, "CHATTER", chatter),
-            mock.patch.object(onset, "slots_for", lambda scene, horizon: SLOTS),
-            mock.patch.object(shift, "slots_for", lambda scene, horizon: SLOTS),
+            mock.patch.object(onset, "SLOTS", SLOTS),
         ):
             program = jax.jit(jax.vmap(sample, (None, 0)))
             parts = [jax.device_get(program(task.theta, keys[at : at + chunk])) for at in range(0, samples, chunk)]

@@ -7,6 +7,7 @@ interface.
 import ctypes
 import functools
 import hashlib
+import itertools
 import os
 import re
 import shlex
@@ -145,7 +146,9 @@ def _build(name: str, source: str) -> Any:
         with elsewhere():
             if (target := cuda.target()) is not None:
                 try:
-                    Path(folder, "kernel").write_bytes(cuda.compile_kernel(source, target.split()[1]))
+                    with _AT_ONCE:
+                        kernel = cuda.compile_kernel(source, target.split()[1])
+                    Path(folder, "kernel").write_bytes(kernel)
                 except ValueError as error:
                     return _failed(written, "NVRTC", str(error))
             done = _compiled(source, library)
@@ -160,12 +163,12 @@ def _compiled(source: str, library: Path) -> subprocess.CompletedProcess[str]:
     flags = *_command(), *(WELL if len(source) < LONG else QUICKLY), *_flags_here(), f"-I{jax.ffi.include_dir()}"
     folder, (head, *shares) = library.parent, source.split(SHARE)
 
-    def one(number: int) -> subprocess.CompletedProcess[str]:
-        Path(folder, f"{number}.c").write_text(head + shares[number] if shares else head)
+    def one(number: int, share: str) -> subprocess.CompletedProcess[str]:
+        Path(folder, f"{number}.c").write_text(head + share)
         return _run(*flags, "-c", f"{number}.c", folder=folder)
 
     with ThreadPoolExecutor(available_cores()) as pool:
-        done = list(pool.map(one, range(max(len(shares), 1))))
+        done = list(pool.map(one, itertools.count(), shares or [""]))
     objects = (f"{number}.o" for number in range(len(done)))
     failed = next((each for each in done if each.returncode), None)
     return failed or _run(*flags, *objects, "-o", library.name, "-lm", "-ldl", folder=folder)

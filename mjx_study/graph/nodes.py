@@ -120,14 +120,13 @@ class ScalarGraph:
     def scalar(self, primitive: Any, arguments: tuple[Any, ...], dtype: Any, **parameters: Any) -> Any:
         """Return one entry of an elementwise operation: a constant, an existing node, or a new one."""
         name = primitive.name
-        numbers = [each.number if isinstance(each, Node) else 0 for each in arguments]
-        if not any(numbers):
-            return _folded(primitive, arguments, dtype, parameters)
         if name in _OF_SIGNED_ZEROS and dtype.kind == "f":
             first, *others = arguments
             first = first if name == "div" else self._signed(first)
             arguments = first, *map(self._signed, others)
-            numbers = [each.number if isinstance(each, Node) else 0 for each in arguments]
+        numbers = [each.number if isinstance(each, Node) else 0 for each in arguments]
+        if not any(numbers):
+            return _folded(primitive, arguments, dtype, parameters)
         if name not in _PLAIN or not all(numbers):
             if (simpler := self._simpler(name, arguments, dtype)) is not None:
                 return simpler
