@@ -130,7 +130,7 @@ class _Parts:
             functions.append(
                 "\n".join(
                     [
-                        f"PART void part{place}(ARGUMENTS) {{ ENTER",
+                        f"PART void part{place}(ARGUMENTS) {{",
                         *recalled,
                         *(each.text for each in part),
                         *(f"KEEP({kinds[at]}, {slots[at]}, x{at});" for at in changed),

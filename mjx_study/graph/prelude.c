@@ -23,7 +23,6 @@
 #define ALL_PARTS static
 #define ARGUMENTS const char *const *in, const long *in_step, char *const *out, const long *out_step, char *kept, \
                   long step
-#define ENTER
 #define PASSED in, in_step, out, out_step, kept, step
 
 #define VECTOR_OF(name, scalar)                                      \

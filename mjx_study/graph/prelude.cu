@@ -21,13 +21,12 @@ typedef int mask;  // -1 or 0
 #define MASK(comparison) (-(mask)(comparison))
 #define ALL(type, constant) ((type)(constant))
 #if LONG
-#define APART static __device__ __noinline__
-#define ENTER __builtin_assume(__isLocal(kept));
+#define PART static __device__ __noinline__
+#define APART_IN_MEMORY 256  // what the samples of a warp keep alternates
 #else
-#define APART static __device__
-#define ENTER
+#define PART static __device__
+#define APART_IN_MEMORY 8
 #endif
-#define PART APART
 #define ALL_PARTS static __device__
 #define ARGUMENTS const struct batch &batch, const long lane, char *kept, long step
 #define PASSED batch, lane, kept, step
@@ -52,8 +51,8 @@ ONE mask select_bool(mask m, mask no, mask yes) { return m ? yes : no; }
 #define PLACE_IN(place, at) (batch.shared[place] ? (at) : (at) * batch.count + lane)
 #define LOAD(type, place, at) (((const type *)batch.in[place])[PLACE_IN(place, at)])
 #define STORE(type, place, at, value) ((type *)batch.out[place])[(at) * batch.count + lane] = (value)
-#define KEEP(type, slot, value) (*(type *)(kept + (slot) * 8) = (value))
-#define RECALL(type, slot) (*(const type *)(kept + (slot) * 8))
+#define KEEP(type, slot, value) (*(type *)(kept + (slot) * APART_IN_MEMORY) = (value))
+#define RECALL(type, slot) (*(const type *)(kept + (slot) * APART_IN_MEMORY))
 #define ENTRY LOAD
 #define CONSTANTS(type) static __device__ const type
 #define TABLE(type, table, at) ((table)[at])
