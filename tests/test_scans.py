@@ -154,7 +154,7 @@ def test_loops_without_passes_or_results():
         (whole_array, "loop with values of type complex128"),
         (random, "loop over random keys"),
         (long, "loop of more than 1000 operations"),
-        (wide, "or 500 values from pass to pass"),
+        (wide, "loop of more than 500 values from pass to pass"),
     ],
 )
 def test_what_stays_a_scan(monkeypatch, loop, reason):

@@ -144,8 +144,8 @@ def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
     except NotWrittenError as error:
         count_left(f"loop with {error}")
         return None
-    except TooLargeError:
-        count_left(f"loop of more than {MOST_OPERATIONS} operations, or {MOST_CARRIED} values from pass to pass")
+    except TooLargeError as error:
+        count_left(f"loop of more than {str(error) or f'{MOST_OPERATIONS} operations'}")
         return None
 
     def scan(*some: Any) -> list[Any]:
@@ -192,8 +192,14 @@ def _body(
         None,
     )
     own, num_carried = function.size - graph.called, sum(given[place].size for place in carried)
-    if function.size > most or own > MOST_OPERATIONS or num_carried > MOST_CARRIED:
-        raise TooLargeError
+    exceeded = {
+        f"{MOST_CARRIED} values from pass to pass": num_carried > MOST_CARRIED,
+        f"{MOST_OPERATIONS} operations": own > MOST_OPERATIONS,
+        f"{most} operations, called code included": function.size > most,
+    }
+    for limit, is_exceeded in exceeded.items():
+        if is_exceeded:
+            raise TooLargeError(limit)
     used = {free[at] for at in function.used}
     places = [place for place in free if place in used or place in carried]
     return function.of([free.index(place) for place in places]), places

@@ -80,7 +80,8 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
     }
     counts = {name: total(dataset[name]) for name in counted if name in dataset}
     found += lost_samples(dataset)
-    found += [f"{count} {counted[name]}" for name, count in counts.items() if count]
+    among = f" ({total(dataset['onsets'])} onsets in all)" if "onsets" in dataset else ""
+    found += [f"{count} {counted[name]}{among * ('onset' in name)}" for name, count in counts.items() if count]
     if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
         found.append(
             f"fewer than {ENOUGH_EFFECTIVE:g} effective samples in batches: {few}; do not trust their errors, "
