@@ -186,7 +186,7 @@ def test_any_optimiser_of_optax(name: str) -> None:
 def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     bare = make_task("pusher", horizon=3).replace(defaults=StudyDefaults(), reference=None)
     monkeypatch.setattr(plan, "task_with_options", lambda *_, **__: bare)
-    with pytest.raises(ValueError, match="`learning_rate` must be given, as must `samples`: pusher has no recipe$"):
+    with pytest.raises(ValueError, match="`learning_rate` must be given, with `samples`: pusher has no recipe$"):
         plan_study(config(horizon=3, samples=None, learning_rate=None))
     (group,) = plan_study(config(horizon=3)).groups
     assert group.recipe is not None and group.recipe.decay == 0.0

@@ -38,8 +38,9 @@ def recipe_of(config: StudyConfig, task: Task) -> Recipe:
     given |= {"decay": given["decay"] or 0.0, "optimizer": given["optimizer"] or "sgd"}
     if missing := [name for name, value in given.items() if value is None]:
         first, *others = missing
-        more = ", as must {}" * len(others)
-        raise OptionError(first, f"must be given{more}: {task.name} has no recipe", *others)
+        more = f", with {' and '.join('{}' for _ in others)}" if others else ""
+        hint = "; `mjx-study init` writes a task with a goal and one" if task.defaults.families == ("mjcf",) else ""
+        raise OptionError(first, f"must be given{more}: {task.name} has no recipe{hint}", *others)
     return Recipe(**given)
 
 
