@@ -40,7 +40,7 @@ BALL = """<mujoco><option timestep=".004" iterations="50" tolerance="1e-15"/><wo
 <geom size=".1" condim="1" solimp=".5 .95 .1"/></body></worldbody></mujoco>"""
 FIELD = """<mujoco><option timestep=".004" iterations="50" ls_iterations="50" tolerance="1e-15"/>
 <asset><hfield name="h" nrow="9" ncol="8" size="1 1 .2 .1" elevation="{}"/></asset>
-<worldbody><geom type="hfield" hfield="h"/><body><freejoint/><geom size=".15" mass="1"/></body></worldbody></mujoco>"""
+<worldbody><geom type="hfield" hfield="h"/><body><freejoint/><geom size=".12" mass="1"/></body></worldbody></mujoco>"""
 SAMPLES = 11
 
 

@@ -9,8 +9,10 @@ import pytest
 
 from estimators import make_estimator
 from mjx_study.cli import main
-from mjx_study.diagnose.means import check_mean, term_lines
+from mjx_study.diagnose.means import check_mean, check_terms, term_lines
+from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.quadrature import Line, Means, grid, means
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 
@@ -38,7 +40,8 @@ def test_commands_judge_means_with_an_onset_term(capsys: pytest.CaptureFixture[s
     largest = max(paths, key=lambda each: abs(each["gap"]))
     assert judged["estimator"] == "fobg_onset" and judged["verdict"] == largest["verdict"]
     assert [judged[name] for name in ("gap", "half_width")] == pytest.approx([largest["gap"], largest["half_width"]])
-    assert "means" not in printed("compare", "--estimators", "fobg", "--reference-samples", "20")
+    common = {"tasks": ("tests.carts:walled_cart",), "contact": ("mujoco_default",)}
+    assert check_terms(plan_study(StudyConfig(**common, estimators=("fobg",)))) == []
     found = printed("optimise", *names, "--iterations", "2", "--learning-rate", "0.1", "--evaluation-samples", "20")
     ((end,),) = [run["theta"] for run in found["runs"] if run["estimator"] == "fobg_onset"]
     (at_end,) = found["means"]

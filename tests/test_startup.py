@@ -141,6 +141,7 @@ def test_commands_run_where_nothing_is_installed(tmp_path: Path) -> None:
     for name in ("mjx_study", "estimators", "models"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     study = "compare pusher --contact reference --stiffness 10 --horizon 2 --samples 4 --reference-samples 4"
+    study += " --estimators zobg"
     command = [sys.executable, "-P", "-c", WITHOUT, str(tmp_path), *study.split(), "--output", "out"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

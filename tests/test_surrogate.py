@@ -29,8 +29,9 @@ def by_hand(task, states, controls) -> np.ndarray:
     """The gradient over controls: costs along the rollout, chained by the closed form's Jacobians at `BACKWARD`."""
     vectors = np.concatenate([states.qpos, states.qvel], axis=1)
     over_state, over_control = ImpedancePusher(BACKWARD, timestep=task.scene.timestep).jacobians(vectors[:-1], controls)
-    of_costs = jax.vmap(jax.grad(task.running_cost, argnums=(0, 1)))(jax.tree.map(lambda x: x[:-1], states), controls)
-    last = jax.grad(task.final_cost)(jax.tree.map(lambda x: x[-1], states))
+    slopes = jax.jit(jax.vmap(jax.grad(task.running_cost, argnums=(0, 1))))
+    of_costs = slopes(jax.tree.map(lambda x: x[:-1], states), controls)
+    last = jax.jit(jax.grad(task.final_cost))(jax.tree.map(lambda x: x[-1], states))
     adjoint = np.concatenate([last.qpos, last.qvel])
     found = np.zeros(len(controls))
     for index in reversed(range(len(controls))):
@@ -49,7 +50,7 @@ def test_costs_are_of_one_contact_and_derivatives_of_the_other(adjoint: str) -> 
     exact = simulator.objective(stiff, NO_NOISE)
     found, plain = (objective.differentiate(theta, sample_keys(1)) for objective in (surrogate, exact))
     np.testing.assert_array_equal(found.value, plain.value)
-    states, controls, *_ = simulate(task, theta, stiff, sample_keys(1)[0], 0.0)
+    states, controls, *_ = jax.jit(lambda key: simulate(task, theta, stiff, key, 0.0))(sample_keys(1)[0])
     expected = by_hand(task, states, np.asarray(controls))
     np.testing.assert_allclose(found.gradient[0], expected, rtol=2e-4)  # the fixture's impedance is not quite MuJoCo's
     assert np.linalg.norm(plain.gradient[0] - expected) > 0.05 * np.linalg.norm(expected)

@@ -17,7 +17,7 @@ CASES = {
     "open loop": (objectives.quadratic(objectives.HESSIAN, 0.7), np.array([0.5, -0.6, 0.3])),
 }
 WEIGHED = ("aobg", "ivw", "ivw_h", "total_propagation", "ddcg")
-SAMPLES, TRIALS = 10, 30_000
+SAMPLES, TRIALS = 10, 12_000
 
 
 def exact(case: str) -> np.ndarray:
@@ -50,7 +50,7 @@ def combined(batches, case: str, name: str, weights: str) -> estimators.Gradient
 @pytest.mark.parametrize("name", WEIGHED)
 @pytest.mark.parametrize("case", CASES)
 def test_cross_fitted_weights_leave_no_bias(batches, case: str, name: str) -> None:
-    """Means of ten samples, 30,000 times; the variance that each states is that of its mean over them."""
+    """Means of ten samples, 12,000 times; the variance that each states is that of its mean over them."""
     found = combined(batches, case, name, "cross_fitted")
     gradient, means = exact(case), np.asarray(found.mean)
     assert_mean_is(means, gradient, resolution=0.05)
