@@ -158,7 +158,7 @@ def test_squared_bias_from_batch_means_is_unbiased_and_its_interval_holds(offset
     def one(key: Array) -> tuple[Array, Array]:
         noise, other = jax.random.split(key)
         means = offset / 20**0.5 + 0.3 * jax.random.normal(noise, (10, 20))
-        reference = summarise(0.05 * 400**0.5 * jax.random.normal(other, (400, 20)))
+        reference = summarise(0.05 * 50**0.5 * jax.random.normal(other, (50, 20)))
         return squared_bias_of_means(means, reference)
 
     value, error = map(np.asarray, one(jax.random.split(jax.random.key(12), 2000)))
