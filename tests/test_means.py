@@ -40,8 +40,8 @@ def test_commands_judge_means_with_an_onset_term(capsys: pytest.CaptureFixture[s
     largest = max(paths, key=lambda each: abs(each["gap"]))
     assert judged["estimator"] == "fobg_onset" and judged["verdict"] == largest["verdict"]
     assert [judged[name] for name in ("gap", "half_width")] == pytest.approx([largest["gap"], largest["half_width"]])
-    common = {"tasks": ("tests.carts:walled_cart",), "contact": ("mujoco_default",)}
-    assert check_terms(plan_study(StudyConfig(**common, estimators=("fobg",)))) == []
+    plain = StudyConfig(tasks=("tests.carts:walled_cart",), contact=("mujoco_default",), estimators=("fobg",))
+    assert check_terms(plan_study(plain)) == []
     found = printed("optimise", *names, "--iterations", "2", "--learning-rate", "0.1", "--evaluation-samples", "20")
     ((end,),) = [run["theta"] for run in found["runs"] if run["estimator"] == "fobg_onset"]
     (at_end,) = found["means"]
