@@ -64,6 +64,7 @@ def test_the_bias_its_correction_and_the_best_estimator(found: Diagnosis) -> Non
     by_name = {each.estimator: each for each in found.estimators}
     assert by_name["fobg"].verdict == "biased" and by_name["fobg_onset"].verdict == "right"
     assert by_name["zobg"].verdict == "unbiased" and by_name["zobg"].bias == 0
+    assert "h^2 k" in "\n".join(page_lines(found))
     assert found.best.estimator in ("fobg_onset", "aobg_onset")
     errors = [each.error(found.norm) for each in found.estimators]
     assert errors == sorted(errors)
