@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study.graph import scalars
+from mjx_study.graph import function, scalars
 from mjx_study.graph.c import source_of
 from mjx_study.graph.function import capture
 from mjx_study.graph.indexing import FEWEST_ROWS
+from mjx_study.graph.linear_map import derivative
 from mjx_study.graph.native import SWITCH
 from mjx_study.graph.nodes import TooLargeError
 from mjx_study.graph.scalars import traced_part, unrolled
@@ -71,6 +72,25 @@ def _loop_in_branch(x):
     )
 
 
+def descent(x):
+    """A loop of known length, whose passes descend to the best of several points; its last value goes unused."""
+    height = lambda y: jnp.sum(jnp.sqrt(1 + (y - x) ** 2) * (2 + jnp.sin(x[2])))  # noqa: E731
+
+    def lower(carry, _):
+        point, _, count = carry
+        points = point - jnp.geomspace(0.01, 2.0, 16)[:, None] * jax.grad(height)(point)
+        best = jnp.argmin(jax.vmap(height)(points))
+        return (points[best], height(points[best]), count + best), None
+
+    (point, _, count), _ = jax.lax.scan(lower, (x[::-1] + 0.1, 0.0, 0), length=5)
+    return point, count
+
+
+def _descent_in_descent(x):
+    """Loops of known length in one, which passes on a scalar."""
+    return jax.lax.fori_loop(0, 3, lambda _, y: descent(x + y / 9)[0] @ x / 4, x[1])
+
+
 FUNCTIONS = {
     "elementwise": lambda x: jnp.where(x > 0, jnp.sin(x) * x**3, jnp.exp(-x)) + jnp.arctan2(x, 2) / jnp.sqrt(1 + x**2),
     "integers": lambda x: (jnp.floor(x).astype(int) % 3, ~(x > 0) | (x < -1), jnp.sign(x), jnp.clip(x, -1, 1)),
@@ -109,6 +129,9 @@ FUNCTIONS = {
     "loop of members along another axis": lambda x: jax.vmap(lambda y: _until(9.0, y)[0], 1, 1)(_members(x)),
     "loop in a loop of members": lambda x: jax.vmap(_loop_in_loop)(_members(x)),
     "loops in branches of members": lambda x: jax.vmap(_loop_in_branch)(_members(x)),
+    "loop of known length": descent,
+    "loop of known length of members": lambda x: jax.vmap(descent)(_members(x)),
+    "loop of known length in another": _descent_in_descent,
     "loop of no step": lambda x: jax.lax.fori_loop(0, 0, lambda _, y: y * 2, x),
     "empty": lambda x: (x[:0], jnp.sum(x[:0]), jnp.zeros((0, 3)) @ x, jnp.zeros((2, 0)) @ x[:0]),
     "constants": lambda x: (jnp.ones(2), 3, jnp.sum(TABLE)),
@@ -152,7 +175,8 @@ def test_the_value_is_the_functions(name, monkeypatch):
 @pytest.mark.parametrize(
     "name",
     ["elementwise", "computed index", "computed indices of large arrays", "add to one place twice", "products",
-     "products of what is computed", "sums", "sums along any axis", "reductions"],
+     "products of what is computed", "sums", "sums along any axis", "reductions", "loop of known length",
+     "loop of known length of members", "loop of known length in another"],
 )  # fmt: skip
 def test_both_modes_differentiate_it(name):
     def total(function, x):
@@ -160,8 +184,8 @@ def test_both_modes_differentiate_it(name):
 
     plain = lambda x: total(FUNCTIONS[name], x)  # noqa: E731
     here = lambda x: total(lambda y: unrolled(FUNCTIONS[name], y), x)  # noqa: E731
-    for derivative in (jax.grad, jax.jacfwd):
-        np.testing.assert_allclose(jax.jit(derivative(here))(ROW), jax.jit(derivative(plain))(ROW), rtol=1e-13)
+    for mode in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(jax.jit(mode(here))(ROW), jax.jit(mode(plain))(ROW), rtol=1e-13)
 
 
 def test_a_functions_own_derivative_is_kept():
@@ -218,6 +242,15 @@ def test_large_constant_arrays_are_tables():
     for size, tables in ((FEWEST_ROWS - 1, 0), (FEWEST_ROWS, 1)):
         source = source_of(capture(partial(looked_up, size), row, most=2000))
         assert source.count("\nCONSTANTS(") == tables and source.count(" = TABLE(") == 3 * tables
+
+
+def test_passes_of_a_known_number_are_a_loop_if_they_are_long(monkeypatch):
+    sizes = []
+    for most in (2_000, 10**6):
+        monkeypatch.setattr(function, "MOST_WRITTEN_OUT", most)
+        found = capture(lambda x: descent(descent(x)[0])[0], jax.ShapeDtypeStruct((3,), float), most=10**5)
+        sizes.append([found.size, derivative(found, (0,)).push.size, derivative(found, (0,)).pull().size])
+    assert np.all(np.divide(*sizes) < 0.5), sizes
 
 
 def test_what_does_not_change_in_a_loop_is_computed_before_it(monkeypatch):

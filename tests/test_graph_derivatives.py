@@ -17,6 +17,7 @@ from mjx_study.graph.native import native_summary
 from mjx_study.graph.nodes import ELEMENTWISE, entries_of
 from mjx_study.graph.operation import applied, computed
 from mjx_study.simulation.linear_algebra import solve_positive_definite
+from tests.test_graph import descent
 from tests.test_second_derivatives import COMPOSITIONS
 
 Function = Callable[..., Any]
@@ -228,6 +229,15 @@ def test_computed_graphs_are_functions_at_every_order(name: str) -> None:
 
     ours = jax.jit(COMPOSED[name](lambda x: total(lambda *inputs: computed(graph, inputs), x)))(ROW)
     all_close(ours, jax.jit(COMPOSED[name](lambda x: total(advance, x)))(ROW), 1e-12)
+
+
+@pytest.mark.parametrize("name", COMPOSED)
+def test_loops_of_known_length_are_functions_at_every_order(name: str) -> None:
+    graph = captured(descent, ROW)
+    assert any(node.operation == "loop" for node in graph.needed)
+    total = lambda found: jnp.sin(found[0]) * found[0][::-1] ** 2  # noqa: E731
+    ours = jax.jit(COMPOSED[name](lambda x: total(computed(graph, [x]))))(ROW)
+    all_close(ours, jax.jit(COMPOSED[name](lambda x: total(descent(x))))(ROW), 1e-11, 1e-12)
 
 
 def equations(x: Any, force: Any, root: Any) -> Any:

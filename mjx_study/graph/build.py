@@ -182,7 +182,9 @@ def _kept(name: str, content: bytes) -> Any:
 
 
 def _failed(written: Path, compiler: str, errors: str) -> None:
-    """Keep a source that failed to compile, with the compiler's errors at its end."""
+    """Keep a source that failed to compile, with the compiler's errors at its end, unless the process is ending."""
+    if not written.exists():
+        return
     kept = Path(tempfile.mkdtemp(prefix="mjx-study-failed-"), written.name)
     kept.write_text(written.read_text() + "".join(f"\n// {line}" for line in errors.splitlines()))
     print(f"mjx-study: {compiler} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)

@@ -15,8 +15,16 @@ import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 
-from mjx_study.graph.function import Passes, ScalarFunction, depending_on
-from mjx_study.graph.nodes import ELEMENTWISE, Node, collection_paused, depth_first, entries_of
+from mjx_study.graph.function import Passes, ScalarFunction
+from mjx_study.graph.nodes import (
+    ELEMENTWISE,
+    LoopBody,
+    Node,
+    collection_paused,
+    depending_on,
+    depth_first,
+    entries_of,
+)
 from mjx_study.graph.parts import Loop, Statement, in_parts
 
 COMPARISONS: Final = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
@@ -208,7 +216,12 @@ class Writer:
         self._stores = {}
         self._stores_of(range(passes.num_carry), function.inputs[first:second])
         end = [self._stored(each.number, each.number) for each in carried]
-        return [*begin, *fixed, Loop([], None, body, _head(passes), rows), *itertools.chain(*end)]
+        return [
+            *begin,
+            *fixed,
+            Loop([], None, body, _head("step", passes.length, passes.reverse), rows),
+            *itertools.chain(*end),
+        ]
 
     def _kinds(self, numbers: Iterable[int]) -> dict[int, str]:
         kinds = {node.number: node.dtype for node in entries_of(self._function.inputs)}
@@ -274,7 +287,7 @@ class Writer:
                     found += self._loop(node)
                 case "output":
                     (loop,), (place, _) = node.arguments, node.parameters
-                    self._names[node.number] = self._names[loop.parameters[0][place].number]
+                    self._names[node.number] = self._names[loop.parameters.carried[place].number]
                 case "whole":
                     raise NotWrittenError(node.parameters[0].primitive.name)
                 case operation:
@@ -298,24 +311,30 @@ class Writer:
         return f"TABLE({kind}, {known.setdefault((kind, entries), f'table{len(known)}')}, {index})"
 
     def _loop(self, node: Node) -> list[Statement | Loop]:
-        carried, again, after = node.parameters
+        body: LoopBody = node.parameters
+        carried, after, length = body.carried, body.after, body.length
         kinds = {each.number: _type(each.dtype) for each in carried}
         starts = zip(kinds.items(), node.arguments, strict=False)
         begin = self._statement([f"{kind} x{at} = {self._value(start)};" for (at, kind), start in starts], kinds)
         outside = dict(self._names) | {at: at for at in kinds}
         self._names = dict(outside)
-        test = self._written(depth_first(again))
-        test.append(self._statement([f"mask x{node.number} = {self._value(again[0])};"], {node.number: "mask"}))
-        body = self._written(depth_first(after))
-        self._uses |= {node.number, *kinds}
-        lines = [
-            f"{kinds[each.number]} next{each.number} = "
-            f"{_select(each.dtype)}(x{node.number}, x{each.number}, {self._value(value)});"
-            for each, value in zip(carried, after, strict=True)
-        ]
-        body.append(self._statement([*lines, *(f"x{at} = next{at};" for at in kinds)], kinds))
+        test: list[Statement | Loop] = []
+        if length is None:
+            test = self._written(depth_first([body.again], self._names))
+            test.append(self._statement([f"mask x{node.number} = {self._value(body.again)};"], {node.number: "mask"}))
+        inside = self._written(depth_first(after, self._names))
+        values = [self._value(each) for each in after]
+        if length is None:
+            self._uses |= {node.number, *kinds}
+            pairs = zip(carried, values, strict=True)
+            values = [f"{_select(each.dtype)}(x{node.number}, x{each.number}, {value})" for each, value in pairs]
+        lines = [f"{kind} next{at} = {value};" for (at, kind), value in zip(kinds.items(), values, strict=True)]
+        self._uses |= kinds.keys()
+        inside.append(self._statement([*lines, *(f"x{at} = next{at};" for at in kinds)], kinds))
         self._names = outside
-        return [begin, Loop(test, node.number, body)]
+        if length is None:
+            return [begin, Loop(test, node.number, inside)]
+        return [begin, Loop([], None, inside, _head(f"int pass{node.number}", length))]
 
     def _expression(self, node: Node) -> str:
         name = node.operation.name
@@ -378,10 +397,11 @@ class Writer:
         return first
 
 
-def _head(passes: Passes) -> str:
-    if passes.reverse:
-        return f"for (step = {passes.length - 1}; step >= 0; step--)"
-    return f"for (step = 0; step < {passes.length}; step++)"
+def _head(counter: str, length: int, reverse: bool = False) -> str:
+    at = counter.split()[-1]
+    if reverse:
+        return f"for ({counter} = {length - 1}; {at} >= 0; {at}--)"
+    return f"for ({counter} = 0; {at} < {length}; {at}++)"
 
 
 def _select(dtype: Any) -> str:

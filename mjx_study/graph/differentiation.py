@@ -8,12 +8,13 @@ Of a selection, only the case that it takes contributes, in reverse mode, too: J
 derivatives by zero, which gives NaN where one is infinite. Here the adjoint of a case counts only where the case is
 taken, which is enforced where adjoints of different cases add up.
 
-Loops and operations on whole arrays have none (`NotDifferentiableError`). The derivative of a solver's loop is that of
-the equation that it solves, see `implicit`.
+The derivatives of what a loop of known length passes on are passed on beside it, over what it starts from and what its
+passes read. Loops that run until a condition holds and operations on whole arrays have none (`NotDifferentiableError`);
+the derivative of a solver's loop is that of the equation that it solves, see `linear_map.implicit_derivative`.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from typing import Any, Final
 
@@ -21,8 +22,8 @@ import jax
 import numpy as np
 from jax import lax
 
-from mjx_study.graph.function import run
-from mjx_study.graph.nodes import Node, ScalarGraph, collection_paused, entries_of, filled, needed_for
+from mjx_study.graph.function import copy_nodes, loop_node, run
+from mjx_study.graph.nodes import LoopBody, Node, ScalarGraph, collection_paused, entries_of, filled, needed_for
 
 Sparse = dict[int, Any]
 """Entries by column; others are zero."""
@@ -57,7 +58,8 @@ def pull(
     Raises:
         NotDifferentiableError: it passes a loop or an operation on whole arrays.
     """
-    needed, ends = needed_for(entries_of(outputs)), {each.number for each in entries_of(inputs)}
+    ends = {each.number for each in entries_of(inputs)}
+    needed = needed_for(entries_of(outputs), ends)
     moving = set(ends)
     for node in needed:
         if _passes(node) and any(_in(moving, each) for each in node.arguments):
@@ -71,10 +73,15 @@ def pull(
     for output, adjoint in zip(entries_of(outputs), entries_of(adjoints), strict=True):
         add(output, adjoint, ())
     for node in reversed(needed):
-        if node.number in ends or not (parts := known.get(node.number)):
+        if not (parts := known.get(node.number)):
+            continue
+        adjoint, where = _gathered(graph, parts, node.dtype)
+        if (loop := _loop_of(node)) is not None:
+            for argument, slope in _slopes(graph, loop, node, moving):
+                product = graph.scalar(lax.mul_p, (adjoint, slope), node.dtype)
+                add(argument, graph.converted(product, argument.dtype), where)
             continue
         _refuse(node)
-        adjoint, where = _gathered(graph, parts, node.dtype)
         for place, argument in enumerate(node.arguments):
             if not _in(moving, argument):
                 continue
@@ -151,8 +158,8 @@ def _arrays(like: Sequence[np.ndarray], found: Sequence[Sparse]) -> list[np.ndar
 def _pushed(graph: ScalarGraph, outputs: Sequence[Any], seeds: Mapping[int, Sparse]) -> list[Sparse]:
     """Changes of the outputs, from those of the inputs by number, for several columns at once."""
     known = dict(seeds)
-    for node in needed_for(outputs):
-        if node.number not in known and (change := _change(graph, node, known)):
+    for node in needed_for(outputs, seeds):
+        if change := _change(graph, node, known):
             known[node.number] = change
     return [known.get(each.number, {}) if isinstance(each, Node) else {} for each in outputs]
 
@@ -163,9 +170,15 @@ def _change(graph: ScalarGraph, node: Node, known: Mapping[int, Sparse]) -> Spar
     if not any(changes) or not _passes(node):
         return {}
     if node.operation in ("whole", "loop"):
-        return next(filter(None, changes))  # its outputs refuse to pass it on
-    _refuse(node)
+        return next(filter(None, changes))  # its outputs refuse to pass it on, or know better
     total: Sparse = {}
+    if (loop := _loop_of(node)) is not None:
+        for argument, slope in _slopes(graph, loop, node, known.keys()):
+            entries = {at: graph.converted(entry, node.dtype) for at, entry in known[argument.number].items()}
+            terms = {at: graph.scalar(lax.mul_p, (entry, slope), node.dtype) for at, entry in entries.items()}
+            _accumulate(graph, total, terms, node.dtype)
+        return total
+    _refuse(node)
     if node.operation is lax.select_n_p:
         which, zero = node.arguments[0], node.dtype.type(0)
         for at in sorted({at for change in changes for at in change}):
@@ -178,7 +191,76 @@ def _change(graph: ScalarGraph, node: Node, known: Mapping[int, Sparse]) -> Spar
     return total
 
 
-def _in(numbers: set[int], entry: Any) -> bool:
+def _loop_of(node: Node) -> Node | None:
+    """The loop of known length whose output a node is."""
+    loop = node.arguments[0] if node.operation == "output" else None
+    return loop if loop and loop.operation == "loop" and loop.parameters.length is not None else None
+
+
+def _slopes(graph: ScalarGraph, loop: Node, output: Node, moving: Collection[int]) -> list[tuple[Node, Any]]:
+    """Arguments of a loop that change, and the derivatives of an output over them, which another loop passes on."""
+    body, (place, _) = loop.parameters, output.parameters
+    live = body.together[place]
+    read = {body.after[at] for at in live}.union(*(each.arguments for each in _inside(body, live)))
+    fixed = [each for each in body.fixed if each in read]
+    places = *live, *itertools.repeat(None, len(fixed))
+    arguments = zip((*(loop.arguments[at] for at in live), *fixed), places, strict=True)
+    columns = [each for each in arguments if _in(moving, each[0]) and each[0].dtype.kind == "f"]
+    key = loop.number, *live, *((argument.number, at) for argument, at in columns)
+    if key not in graph.slopes:
+        graph.slopes[key] = _with_slopes(graph, loop, live, columns)
+    return graph.slopes[key][place]
+
+
+def _inside(body: LoopBody, live: Sequence[int]) -> list[Node]:
+    """What changes from pass to pass that the entries at some places need."""
+    outside = {each.number for each in (*body.carried, *body.fixed)}
+    return needed_for((body.after[at] for at in live), outside)
+
+
+def _with_slopes(
+    graph: ScalarGraph, loop: Node, live: Sequence[int], columns: Sequence[tuple[Node, int | None]]
+) -> dict[int, list[tuple[Node, Any]]]:
+    """Derivatives of what a loop passes on at the places `live` over `columns`, arguments that stand at a place at the
+    start or are read by every pass."""
+    body = loop.parameters
+    carried = {at: graph.node("carry", (), None, body.carried[at].dtype) for at in live}
+    values: dict[int, Any] = {each.number: each for each in body.fixed}
+    values |= {body.carried[at].number: each for at, each in carried.items()}
+    copy_nodes(graph, _inside(body, live), values)
+    after = {at: values.get(getattr(body.after[at], "number", 0), body.after[at]) for at in live}
+    rows = [at for at in live if carried[at].dtype.kind == "f"]
+    slopes = {at: [graph.node("carry", (), None, carried[at].dtype) for _ in columns] for at in rows}
+    ends = [carried[at] for at in rows] + [each for each, start in columns if start is None]
+    next_slopes: list[Any] = []
+    for at in rows:
+        dtype = carried[at].dtype
+        one_row, one = filled((1,), [after[at]]), filled((1,), [dtype.type(1)])
+        (over,) = pull(graph, [one_row], [filled((len(ends),), ends)], [one])
+        direct = iter(over[len(rows) :])
+        total: Sparse = {
+            column: graph.converted(next(direct), dtype) for column, (_, start) in enumerate(columns) if start is None
+        }
+        for row, factor in zip(rows, over, strict=False):
+            through = graph.converted(factor, dtype)
+            terms = {
+                column: graph.scalar(lax.mul_p, (through, graph.converted(each, dtype)), dtype)
+                for column, each in enumerate(slopes[row])
+            }
+            _accumulate(graph, total, terms, dtype)
+        next_slopes += [total.get(column, dtype.type(0)) for column in range(len(columns))]
+    starts = [carried[at].dtype.type(at == start) for at in rows for _, start in columns]
+    entries = [*carried.values(), *itertools.chain(*slopes.values())]
+    whole = LoopBody(entries, [*after.values(), *next_slopes], length=body.length)
+    both = loop_node(graph, [*(loop.arguments[at] for at in live), *starts], whole)
+    places = itertools.count(len(live))
+    return {
+        at: [(each, graph.node("output", (both,), (next(places), ()), carried[at].dtype)) for each, _ in columns]
+        for at in rows
+    }
+
+
+def _in(numbers: Collection[int], entry: Any) -> bool:
     return isinstance(entry, Node) and entry.number in numbers
 
 

@@ -12,7 +12,7 @@ from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
 from mjx_study.graph.function import ScalarFunction, array_of, bind_whole
-from mjx_study.graph.nodes import Node, needed_for
+from mjx_study.graph.nodes import LoopBody, Node
 
 
 def evaluated(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
@@ -65,13 +65,15 @@ def _emit(nodes: Iterable[Node], values: dict[int, Any]) -> None:
 
 
 def _emit_loop(node: Node, arguments: list[Any], values: dict[int, Any]) -> Any:
-    carried, again, after = node.parameters
-    fixed = {each.number: values[each.number] for each in node.arguments[len(carried) :]}
+    body: LoopBody = node.parameters
+    fixed = {each.number: values[each.number] for each in body.fixed}
 
     def at(carry: Sequence[Any], outputs: Sequence[Any]) -> list[Any]:
-        local = fixed | {each.number: value for each, value in zip(carried, carry, strict=True)}
-        _emit(needed_for(outputs), local)
+        local = fixed | {each.number: value for each, value in zip(body.carried, carry, strict=True)}
+        _emit(body.inside, local)
         return [local[each.number] if isinstance(each, Node) else jnp.asarray(each) for each in outputs]
 
-    start = [jnp.asarray(each) for each in arguments[: len(carried)]]
-    return lax.while_loop(lambda carry: at(carry, again)[0], lambda carry: at(carry, after), start)
+    start = [jnp.asarray(each) for each in arguments[: len(body.carried)]]
+    if body.length is not None:
+        return lax.fori_loop(0, body.length, lambda _, carry: at(carry, body.after), start)
+    return lax.while_loop(lambda carry: at(carry, [body.again])[0], lambda carry: at(carry, body.after), start)

@@ -16,6 +16,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from mjx_study.graph.nodes import (
     ELEMENTWISE,
+    LoopBody,
     Node,
     ScalarGraph,
     TooLargeError,
@@ -32,6 +33,10 @@ MOST_KEPT: Final = 64
 MOST_FOLDED: Final = 10
 """Maximum number of entries that a function computes, in multiples of the scalar operations allowed; robots have 2 to 9
 times as many entries as operations."""
+MOST_WRITTEN_OUT: Final = 2_000
+"""Maximum number of operations of all passes of a `scan` for which they are written out one after the other."""
+MOST_INTERDEPENDENT: Final = 8
+"""Maximum number of values that depend on each other in a loop in their place; its derivative takes their square."""
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 _WITH_RULES: Final = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "ruled": "jaxpr"}
@@ -96,8 +101,7 @@ def _count(nodes: list[Node], found: set[int]) -> None:
     found |= {each.number for each in nodes}
     for each in nodes:
         if each.operation == "loop":
-            _, again, after = each.parameters
-            _count(needed_for([*again, *after]), found)
+            _count(each.parameters.inside, found)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,9 +243,17 @@ def _branch(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> 
 
 
 def _scan(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Write out all passes of a loop of known length."""
+    """Write out all passes of a loop of known length, unless they are long and need nothing but what is carried."""
     parameters = equation.params
     consts, carry, rows = scan_inputs(equation, inputs)
+    if len(carry) == len(equation.outvars) and not rows and parameters["length"] > 1:
+        avals, before = [each.aval for each in equation.outvars], graph.size
+        during = [graph.fresh("carry", aval.shape, aval.dtype) for aval in avals]
+        after = run(graph, parameters["jaxpr"], [*consts, *during])
+        body = LoopBody(entries_of(during), entries_of(after), length=parameters["length"])
+        is_long = (graph.size - before) * parameters["length"] > MOST_WRITTEN_OUT
+        if is_long and max(map(len, body.together), default=0) <= MOST_INTERDEPENDENT:
+            return _loop_outputs(graph, entries_of(carry), body, avals)
     avals = [each.aval for each in equation.outvars[len(carry) :]]
     stacked = [np.empty(aval.shape, object) for aval in avals]
     passes = range(parameters["length"])
@@ -275,14 +287,14 @@ def _native(
         for array, nodes in zip(inputs, function.inputs, strict=True):
             entries = array[(*at, ...)] if array.ndim > nodes.ndim else array
             values |= zip((node.number for node in nodes.flat), entries.flat, strict=True)
-        _copy(graph, function.needed, values)
+        copy_nodes(graph, function.needed, values)
         for every, array in zip(outputs, function.outputs, strict=True):
             found = (values[each.number] if isinstance(each, Node) else each for each in array.flat)
             every[at] = filled(array.shape, found)[()]
     return outputs
 
 
-def _copy(graph: ScalarGraph, nodes: Iterable[Node], values: dict[int, Any]) -> None:
+def copy_nodes(graph: ScalarGraph, nodes: Iterable[Node], values: dict[int, Any]) -> None:
     """Add nodes of another graph, arguments first, where they are not in `values` yet."""
 
     def copies(entries: Iterable[Any], values: dict[int, Any]) -> list[Any]:
@@ -293,11 +305,11 @@ def _copy(graph: ScalarGraph, nodes: Iterable[Node], values: dict[int, Any]) -> 
             continue
         arguments, parameters = copies(node.arguments, values), node.parameters
         if node.operation == "loop":
-            old, *ends = parameters
-            carried = [graph.node("carry", (), None, each.dtype) for each in old]
-            inside = values | {each.number: new for each, new in zip(old, carried, strict=True)}
-            _copy(graph, needed_for(itertools.chain(*ends)), inside)
-            copied = _loop_node(graph, arguments[: len(old)], carried, *(copies(end, inside) for end in ends))
+            carried = [graph.node("carry", (), None, each.dtype) for each in parameters.carried]
+            inside = values | {each.number: new for each, new in zip(parameters.carried, carried, strict=True)}
+            copy_nodes(graph, parameters.inside, inside)
+            after, (again,) = copies(parameters.after, inside), copies([parameters.again], inside)
+            copied = loop_node(graph, arguments[: len(carried)], LoopBody(carried, after, again, parameters.length))
         elif isinstance(node.operation, str):
             copied = graph.node(node.operation, tuple(arguments), parameters, node.dtype)
         else:
@@ -321,27 +333,21 @@ def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[n
         wide = [members.reshape(*members.shape, *[1] * (len(aval.shape) - members.ndim)) for aval in avals]
         cases = zip(wide, during, after, avals, strict=True)
         after = [graph.elementwise(lax.select_n_p, each, aval) for *each, aval in cases]
-    carried = entries_of(during)
-    node = _loop_node(graph, entries_of(inputs[second:]), carried, entries_of([again]), entries_of(after))
-    flat = [ShapedArray((), each.dtype) for each in carried]
+    return _loop_outputs(
+        graph, entries_of(inputs[second:]), LoopBody(entries_of(during), entries_of(after), again[()]), avals
+    )
+
+
+def _loop_outputs(graph: ScalarGraph, start: Sequence[Any], body: LoopBody, avals: Sequence[Any]) -> list[np.ndarray]:
+    node = loop_node(graph, start, body)
+    flat = [ShapedArray((), each.dtype) for each in body.carried]
     scalars = iter([each[()] for each in graph.outputs(node, flat)])
     return [filled(aval.shape, itertools.islice(scalars, math.prod(aval.shape))) for aval in avals]
 
 
-def _loop_node(graph: ScalarGraph, start: list[Any], carried: list[Node], again: list[Any], after: list[Any]) -> Node:
-    needed = needed_for([*again, *after])
-    changing = depending_on(needed, carried)
-    fixed = [each for each in needed if each.number not in changing]
-    return graph.node("loop", (*start, *fixed), (carried, again, after), None)
-
-
-def depending_on(nodes: Iterable[Node], some: Iterable[Node]) -> set[int]:
-    """Numbers of some nodes, and of those among `nodes`, arguments first, that depend on them."""
-    found = {each.number for each in some}
-    for node in nodes:
-        if any(isinstance(each, Node) and each.number in found for each in node.arguments):
-            found.add(node.number)
-    return found
+def loop_node(graph: ScalarGraph, start: Sequence[Any], body: LoopBody) -> Node:
+    """A loop, from what it starts from."""
+    return graph.node("loop", (*start, *body.fixed), body, None)
 
 
 def bind_whole(equation: Any, arrays: Sequence[Any]) -> Sequence[jax.Array]:

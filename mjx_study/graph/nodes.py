@@ -3,8 +3,10 @@
 import gc
 import itertools
 import math
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Container, Generator, Iterable, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import jax
@@ -68,10 +70,11 @@ def collection_paused() -> Generator[None]:
 class Node:
     """A scalar that depends on the inputs: an operation, with nodes and NumPy scalars as arguments.
 
-    `operation` is a JAX primitive or "input", "carry" (of a loop), "whole" (an operation on whole arrays), "loop",
-    "output" (an entry of the result of one of the last two, its only argument), "entry" (of an input at a computed
-    index; the parameter is how far its entries are apart, the first of them an argument), or "table" (entry of a
-    constant vector, the parameter, at a computed index). Arguments have lower numbers.
+    `operation` is a JAX primitive or "input", "carry" (of a loop), "whole" (an operation on whole arrays), "loop" (the
+    parameter is a `LoopBody`; the arguments are what it starts from, and what is fixed in it), "output" (an entry of
+    the result of one of the last two, its only argument), "entry" (of an input at a computed index; the parameter is
+    how far its entries are apart, the first of them an argument), or "table" (entry of a constant vector, the
+    parameter, at a computed index). Arguments have lower numbers.
     """
 
     __slots__ = ("arguments", "dtype", "number", "operation", "parameters")
@@ -81,30 +84,79 @@ class Node:
         self.parameters, self.dtype = parameters, dtype
 
 
+@dataclass(frozen=True, eq=False)
+class LoopBody:
+    """What a loop computes.
+
+    Attributes:
+        carried: nodes that stand for what is passed on, in a pass; they are the first of its nodes.
+        after: what is passed on to the next one.
+        again: whether there is a pass, as an entry; None if there are `length`.
+        length: number of passes, of a loop without `again`.
+    """
+
+    carried: Sequence[Node]
+    after: Sequence[Any]
+    again: Any = None
+    length: int | None = None
+
+    @cached_property
+    def inside(self) -> list[Node]:
+        """What changes from pass to pass, arguments first, without what is passed on."""
+        passed_on = {each.number for each in self.carried}
+        needed = needed_for([*self.after, self.again], range(min(passed_on, default=0)))
+        changing = depending_on(needed, self.carried)
+        return [each for each in needed if each.number in changing and each.number not in passed_on]
+
+    @cached_property
+    def fixed(self) -> list[Node]:
+        """What passes read that does not change."""
+        changing = {each.number for each in (*self.carried, *self.inside)}
+        read = itertools.chain(self.after, [self.again], *(each.arguments for each in self.inside))
+        found = {each.number: each for each in read if isinstance(each, Node) and each.number not in changing}
+        return [found[number] for number in sorted(found)]
+
+    @cached_property
+    def together(self) -> list[list[int]]:
+        """For each value that is passed on, the places of those on which it comes to depend."""
+        places: dict[int, set[int]] = {each.number: {place} for place, each in enumerate(self.carried)}
+        for node in self.inside:
+            of = [places[each.number] for each in node.arguments if isinstance(each, Node) and each.number in places]
+            places[node.number] = of[0] if all(each is of[0] for each in of) else set().union(*of)
+        found = [{place} | places.get(getattr(each, "number", 0), set()) for place, each in enumerate(self.after)]
+        before: list[set[int]] = []
+        while found != before:
+            before, found = found, [set().union(*(found[place] for place in some)) for some in found]
+        return [sorted(each) for each in found]
+
+
 class ScalarGraph:
     """The operations of a function, without duplicates.
 
     Attributes:
+        size: number of nodes.
         most: maximum number of nodes, beyond which new ones raise `TooLargeError`; None for any number.
         values_only: whether calls with a derivative of their own are written out, too, which loses it.
         arrays: inputs by the numbers of their entries, if computed indices may read them in memory.
         called: number of operations that come from native code.
+        slopes: derivatives of outputs of loops, which are computed once.
     """
 
     def __init__(self, most: int | None, values_only: bool = False):
-        self.most, self.values_only, self._count = most, values_only, 0
+        self.most, self.values_only, self.size = most, values_only, 0
         self.arrays: dict[int, int] = {}
         self.called = 0
+        self.slopes: dict[Any, Any] = {}
         self._known: dict[Any, Node] = {}
         self._sums: set[int] = set()
         self._from_zero: dict[int, Any] = {}
         self._never_minus_zero: set[int] = set()
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:
-        self._count += 1
-        if self.most is not None and self._count > self.most:
+        self.size += 1
+        if self.most is not None and self.size > self.most:
             raise TooLargeError
-        return Node(self._count, operation, arguments, parameters, dtype)
+        return Node(self.size, operation, arguments, parameters, dtype)
 
     def fresh(self, kind: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         """Create an array of nodes without arguments."""
@@ -287,32 +339,44 @@ def _folded(primitive: Any, arguments: tuple[Any, ...], dtype: Any, parameters: 
         return dtype.type(np.asarray(primitive.bind(*map(jnp.asarray, arguments), **parameters)))
 
 
-def needed_for(outputs: Iterable[Any]) -> list[Node]:
-    """Return the nodes that the outputs depend on, arguments first."""
+def needed_for(outputs: Iterable[Any], known: Container[int] = ()) -> list[Node]:
+    """Return the nodes that the outputs depend on, arguments first, without `known` ones and what only these need."""
     found: dict[int, Node] = {}
     stack = [each for each in outputs if isinstance(each, Node)]
     while stack:
         node = stack.pop()
-        if node.number not in found:
+        if node.number not in found and node.number not in known:
             found[node.number] = node
             stack += [each for each in node.arguments if isinstance(each, Node)]
     return [found[number] for number in sorted(found)]
 
 
-def depth_first(outputs: Iterable[Any]) -> list[Node]:
+def depending_on(nodes: Iterable[Node], some: Iterable[Node]) -> set[int]:
+    """Numbers of some nodes, and of those among `nodes`, arguments first, that depend on them."""
+    found = {each.number for each in some}
+    for node in nodes:
+        if any(isinstance(each, Node) and each.number in found for each in node.arguments):
+            found.add(node.number)
+    return found
+
+
+def depth_first(outputs: Iterable[Any], known: Container[int] = ()) -> list[Node]:
     """The nodes of `needed_for` in another order: the arguments of each right before it, the deepest one first.
 
     Values are then used soon after they are computed, as far as that goes: of a quadruped's step, half as many have to
     leave a processor's registers as in the order of the trace.
     """
-    nodes = needed_for(outputs)
-    arguments = {node.number: _read_by(node) for node in nodes}
+    nodes = needed_for(outputs, known)
+    arguments = {
+        node.number: [each for each in node.arguments if isinstance(each, Node) and each.number not in known]
+        for node in nodes
+    }
     depth: dict[int, int] = {}
     for node in nodes:
         depth[node.number] = 1 + max((depth[each.number] for each in arguments[node.number]), default=0)
         arguments[node.number].sort(key=lambda each: depth[each.number])
     found: dict[int, Node] = {}
-    stack = [each for each in outputs if isinstance(each, Node)][::-1]
+    stack = [each for each in outputs if isinstance(each, Node) and each.number not in known][::-1]
     while stack:
         left = arguments[stack[-1].number]
         if left:
@@ -323,16 +387,3 @@ def depth_first(outputs: Iterable[Any]) -> list[Node]:
             node = stack.pop()
             found[node.number] = node
     return list(found.values())
-
-
-def _read_by(node: Node) -> list[Node]:
-    """The arguments of a node that are nodes; of a loop only those that its passes read."""
-    read = node.arguments
-    if node.operation == "loop":
-        carried, again, after = node.parameters
-        outside = {each.number for each in node.arguments[len(carried) :]}
-        inside = [each for each in needed_for([*again, *after]) if each.number not in outside]
-        ends = itertools.chain(again, after, *(each.arguments for each in inside))
-        own = (each for each in ends if isinstance(each, Node) and each.number in outside)
-        read = (*node.arguments[: len(carried)], *{each.number: each for each in own}.values())
-    return [each for each in read if isinstance(each, Node)]

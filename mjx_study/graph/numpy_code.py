@@ -88,10 +88,12 @@ class _Text:
 
     def _passes(self, loop: Loop) -> list[str]:
         """A loop of known length."""
-        last, first = (re.search(pattern, loop.head) for pattern in (r"step < (\d+)", r"step = (\d+); step >= 0"))
-        passes = f"range({last[1]})" if last else f"range({first[1]}, -1, -1)" if first else ""
+        last, first = (re.search(pattern, loop.head) for pattern in (r"(\w+) < (\d+)", r"(\w+) = (\d+); \w+ >= 0"))
+        found = last or first
+        assert found is not None
+        passes = f"range({found[2]})" if last else f"range({found[2]}, -1, -1)"
         inside = [*map(self.python, loop.loads.values()), *self.lines(loop.body, loop.together().uses)]
-        return [f"for step in {passes}:", *_indented(inside)]
+        return [f"for {found[1]} in {passes}:", *_indented(inside)]
 
     def _until_all_end(self, loop: Loop, again: int, whole: Statement) -> str:
         """The call of a loop whose passes are a function of their own."""

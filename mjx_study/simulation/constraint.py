@@ -75,33 +75,35 @@ def row_force(model: mjx.Model, data: mjx.Data, slack: Rows) -> Rows:
 
 
 def _elliptic_force(model: mjx.Model, rows: Any, slack: Rows, linear: Rows, force: Rows) -> Rows:
-    """Replace the rows of elliptic contacts in `force`.
+    """Replace the rows of elliptic contacts in `force`; those of the same dimension at once.
 
     With the scaled slack u = (mu x_n, friction * x_t), N = u_n, T = |u_t|: if separated (N >= mu T), no force; if
     sticking (mu N + T <= 0), linear; if sliding (in between, on the cone), force -dm mu (N - mu T) along (1, -u_t / T).
     The branch not taken is evaluated at a safe T, so the derivative is finite at T = 0.
     """
     contact = rows.contact
-    for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
-        if condim == 1:
-            continue
-        span = slice(int(address), int(address) + int(condim))
-        friction = contact.friction[index, : condim - 1]
-        mu = friction[0] / jnp.sqrt(model.opt.impratio)
-        normal = mu * slack[span][0]
-        tangent = friction * slack[span][1:]
+    condims, addresses = np.asarray(contact.dim), np.asarray(contact.efc_address)
+    for condim in np.unique(condims[condims > 1]):
+        (alike,) = np.nonzero(condims == condim)
+        span = addresses[alike][:, None] + np.arange(condim)
+        friction = contact.friction[alike, : condim - 1]
+        mu = friction[:, 0] / jnp.sqrt(model.opt.impratio)
+        normal = mu * slack[span[:, 0]]
+        tangent = friction * slack[span[:, 1:]]
 
-        square = jnp.sum(tangent**2)
+        square = jnp.sum(tangent**2, axis=1)
         moving = square > 0
         length = jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1.0)), 0.0)
         safe_length = jnp.where(moving, length, 1.0)
         sticking = jnp.where(moving, mu * normal + length <= 0, normal < 0)
         sliding = moving & (normal < mu * length) & (mu * normal + length > 0)
 
-        stiffness = rows.efc_D[span][0] / jnp.maximum(mu * mu * (1 + mu * mu), mujoco.mjMINVAL)
+        stiffness = rows.efc_D[span[:, 0]] / jnp.maximum(mu * mu * (1 + mu * mu), mujoco.mjMINVAL)
         magnitude = -stiffness * mu * (normal - mu * length)
-        on_cone = jnp.concatenate([magnitude[None], -magnitude * friction * tangent / safe_length])
-        force = force.at[span].set(jnp.where(sticking, linear[span], jnp.where(sliding, on_cone, 0.0)))
+        along = -magnitude[:, None] * friction * tangent / safe_length[:, None]
+        on_cone = jnp.concatenate([magnitude[:, None], along], axis=1)
+        others = jnp.where(sliding[:, None], on_cone, 0.0)
+        force = force.at[span].set(jnp.where(sticking[:, None], linear[span], others))
     return force
 
 
