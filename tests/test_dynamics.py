@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_study.graph.native import native_summary
 from mjx_study.simulation import constraint, dynamics
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact, contact_model
@@ -26,6 +27,7 @@ from tests.scenes import (
     in_both_modes,
     option,
     plain_warm_start,
+    run,
     scene_of,
     sizes,
     slider,
@@ -406,11 +408,16 @@ PENDULUM = """
 def test_runge_kutta_is_mjxs() -> None:
     """A pendulum with an activated motor."""
     scene = scene_of(PENDULUM)
-    assert not scene.has_constraints and not scene.uses_graph
+    assert not scene.has_constraints
     point = np.array([0.9, 2.5, 0.3, 0.7])
-    step = lambda of, x: of(scene, scene.model, x, jnp.zeros(1))[0]  # noqa: E731
+    step = lambda of, x, scene=scene: of(scene, scene.model, x, jnp.zeros(1))[0]  # noqa: E731
     program = compiled(lambda x: (step(step_flat, x), step(stock_step_flat, x)), point)
     for _ in range(20):
         ours, stock = program(point)
         np.testing.assert_allclose(ours, stock, rtol=0, atol=1e-13)
         point = np.concatenate([ours, point[-1:]])
+    taped = dataclasses.replace(scene, adjoint="tape")
+    before = native_summary().partition(",")[2]
+    jacobians = [run(in_both_modes(partial(step, step_flat, scene=each)), point)[1:] for each in (scene, taped)]
+    assert native_summary().partition(",")[2] == before, "the step is no graph"
+    assert scene.uses_graph and np.ptp(np.reshape(jacobians, (4, -1)), axis=0).max() < 1e-12

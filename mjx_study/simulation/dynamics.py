@@ -107,9 +107,6 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tupl
         following, qacc, residual = _step_of_law(scene, model, state, control)
         qacc, residual = jax.lax.stop_gradient((qacc, residual))
         return dataclasses.replace(following, warmstart=qacc), residual
-    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        advance = jax.checkpoint(entry_by_entry, static_argnums=0)
-        return advance(partial(_runge_kutta, scene), model, state, control), jnp.zeros_like(state.qpos, shape=())
     following, residual = _differentiable_step(scene, model, state, control)
     warmstart, residual = jax.lax.stop_gradient((following.warmstart, residual))
     return dataclasses.replace(following, warmstart=warmstart), residual
@@ -119,8 +116,6 @@ def acceleration(scene: Scene, model: mjx.Model, state: State, control: Control)
     """Constrained acceleration during a `step` [m/s^2 or rad/s^2], with its implicit derivative."""
     if isinstance(model, LawModel):
         return _step_of_law(scene, model, state, control)[1]
-    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:  # without constraints
-        return smooth_stages(scene, model, state, control).qacc_smooth
     return _differentiable_step(scene, model, state, control)[0].warmstart
 
 
@@ -333,6 +328,11 @@ def advance_velocity(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> tuple[Qvel
 
 def _differentiable_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar]:
     """`step`, with a derivative of the acceleration, too: for second derivatives."""
+    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        explicit = partial(_runge_kutta, scene)
+        taped = jax.checkpoint(explicit)
+        advance = partial(entry_by_entry, explicit, otherwise=taped) if scene.uses_graph else taped
+        return advance(model, state, control), jnp.zeros_like(state.qpos, shape=())
     traced_model, whole = traced_part(model)
 
     def solved(traced: Any, state: State, control: Control) -> tuple[State, Scalar]:
@@ -547,7 +547,7 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Control)
     fourth = slopes(*moved(1.0, third))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
     qpos, qvel, _ = moved(1.0, mean)
-    qacc = jax.lax.stop_gradient(first[1])
+    qacc = first[1]
     if state.act.size == 0:
         return State(qpos, qvel, state.act, qacc)
     # MJX's own activation update, with its clamping

@@ -53,7 +53,7 @@ class Scene:
         adjoint: how steps are differentiated; the derivatives agree to rounding.
 
             - "graph": as graphs of scalar operations (`mjx_study.graph`); a step that is none, or too large a one, by
-              its matrix, in forward mode. Not for RK4.
+              its matrix, in forward mode, or with RK4 by the tape.
             - "tape": automatic differentiation of MJX's own operations around the implicit solve; reverse mode computes
               each step again (fault 13 in `docs/gradient-faults.md`).
             - "auto": graphs in native code, and up to `MOST_UNROLLED` degrees of freedom; else the tape.
@@ -61,7 +61,7 @@ class Scene:
             Derivatives with respect to the model always use the tape.
 
     Raises:
-        SceneError: unknown adjoint, or "graph" with RK4.
+        SceneError: unknown adjoint.
     """
 
     name: str
@@ -73,23 +73,17 @@ class Scene:
     def __post_init__(self) -> None:
         if self.adjoint not in ADJOINTS:
             raise SceneError(unknown("adjoint", self.adjoint, ADJOINTS))
-        if self.adjoint == "graph" and self._explicit:
-            raise SceneError(f"{self.name}: the adjoint 'graph' does not support RK4; choose auto or tape")
 
     @property
     def uses_graph(self) -> bool:
         """Whether steps are differentiated as graphs rather than by the tape."""
-        return self.forms_matrix or (self.adjoint == "auto" and native_identity() is not None and not self._explicit)
+        return self.forms_matrix or (self.adjoint == "auto" and native_identity() is not None)
 
     @property
     def forms_matrix(self) -> bool:
         """Whether steps that are no graph are differentiated by their matrix rather than by the tape."""
         small = self.host.nv <= MOST_UNROLLED
-        return self.adjoint == "graph" or (self.adjoint == "auto" and small and not self._explicit)
-
-    @property
-    def _explicit(self) -> bool:
-        return self.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        return self.adjoint == "graph" or (self.adjoint == "auto" and small)
 
     @property
     def timestep(self) -> float:
