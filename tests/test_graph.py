@@ -132,6 +132,7 @@ FUNCTIONS = {
     "loop of known length": descent,
     "loop of known length of members": lambda x: jax.vmap(descent)(_members(x)),
     "loop of known length in another": _descent_in_descent,
+    "recomputed": lambda x: jax.checkpoint(lambda y: jnp.sin(y) * jax.checkpoint(jnp.cumsum)(y + TABLE[0, 0]))(x),
     "loop of no step": lambda x: jax.lax.fori_loop(0, 0, lambda _, y: y * 2, x),
     "empty": lambda x: (x[:0], jnp.sum(x[:0]), jnp.zeros((0, 3)) @ x, jnp.zeros((2, 0)) @ x[:0]),
     "constants": lambda x: (jnp.ones(2), 3, jnp.sum(TABLE)),
@@ -175,7 +176,7 @@ def test_the_value_is_the_functions(name, monkeypatch):
 @pytest.mark.parametrize(
     "name",
     ["elementwise", "computed index", "computed indices of large arrays", "add to one place twice", "products",
-     "products of what is computed", "sums", "sums along any axis", "reductions", "loop of known length",
+     "products of what is computed", "sums", "sums along any axis", "reductions", "recomputed", "loop of known length",
      "loop of known length of members", "loop of known length in another"],
 )  # fmt: skip
 def test_both_modes_differentiate_it(name):

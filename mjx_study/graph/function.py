@@ -38,7 +38,7 @@ MOST_WRITTEN_OUT: Final = 2_000
 MOST_INTERDEPENDENT: Final = 8
 """Maximum number of values that depend on each other in a loop in their place; its derivative takes their square."""
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
-_CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
+_CALLS: Final = {"closed_call": "call_jaxpr", **dict.fromkeys(("checkpoint", "jit", "pjit", "remat2"), "jaxpr")}
 _WITH_RULES: Final = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "ruled": "jaxpr"}
 """Calls with a derivative of their own, which are operations on whole arrays unless only values are wanted."""
 
@@ -180,8 +180,8 @@ def inlined(graph: ScalarGraph, function: Callable[..., Any], *arrays: np.ndarra
 
 
 def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Evaluate a closed jaxpr; array entries are nodes or NumPy scalars."""
-    jaxpr, consts = closed.jaxpr, [constants(each) for each in closed.consts]
+    """Evaluate a jaxpr, closed or without constants; array entries are nodes or NumPy scalars."""
+    jaxpr, consts = getattr(closed, "jaxpr", closed), [constants(each) for each in getattr(closed, "consts", ())]
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
 
     def read(atom: Any) -> np.ndarray:
