@@ -104,7 +104,7 @@ def _degenerate(host: mujoco.MjModel, geoms: tuple[int, ...], cause: str) -> Deg
 
 def cause_of_fault(context: FindingContext, output: Coordinate, source: Coordinate, *, stock: bool = False) -> str:
     """Return the likely reason why a derivative is wrong, zero or NaN."""
-    return next(_faults(context, output, source, stock), "unknown")
+    return next(_faults(context, output, source, stock), "cause unknown")
 
 
 def cause_of_kink(context: FindingContext, output: Coordinate, source: Coordinate) -> str:

@@ -44,7 +44,8 @@ Found = tuple[str, bool]
 
 @dataclasses.dataclass(frozen=True)
 class Values:
-    """Differences between the states after one step, all solved to rounding, relative to the step's change.
+    """Differences between the states after one step, all solved to rounding, relative to the change that its forces
+    cause, balanced or not.
 
     Attributes:
         stock, engine: difference of this project's state from that of `mjx.step`, and from the C engine's.
@@ -82,7 +83,8 @@ def compare_values(
         noise: rounding noise of each output; at rest, all of its change.
     """
     theirs = engine_step.after(state)
-    gaps = [_apart(layout, state, ours, other, noise) for other in (stock, theirs)]
+    driven = largest(stages["qacc_smooth"])
+    gaps = [_apart(layout, state, ours, other, driven, noise) for other in (stock, theirs)]
     from_stock, from_engine = (float(gap.max()) for gap in gaps)
     verdict, cause = None, ""
     if not np.all(np.isfinite(ours.warmstart)):
@@ -92,7 +94,11 @@ def compare_values(
         if from_engine <= TOLERANCE:
             cause = "mjx.step differs from the step of this project and the C engine"
         else:
-            third = "mjx.step" if float(_apart(layout, state, stock, theirs, noise).max()) <= TOLERANCE else "neither"
+            third = (
+                "mjx.step"
+                if float(_apart(layout, state, stock, theirs, driven, noise).max()) <= TOLERANCE
+                else "neither"
+            )
             cause = f"this project's step is not that of mjx.step; the C engine agrees with {third}"
     elif not from_engine <= TOLERANCE:
         cause, documented = difference_of_engines(engine_step.host, state, stages, ours.warmstart, theirs.warmstart)
@@ -114,13 +120,18 @@ def _apart(
     before: HostState,
     ours: HostState,
     theirs: HostState,
+    driven: float,
     noise: Float[np.ndarray, " outputs"] | float,
 ) -> Float[np.ndarray, " outputs"]:
-    """Difference of two next states beyond rounding, relative to the largest velocity, acceleration, activation."""
+    """Difference of two next states beyond rounding, relative to the largest velocity, acceleration, activation.
+
+    The acceleration is at least `driven`, which constraints balance at rest: solvers stop within a share of that.
+    """
     host, timestep = layout.scene.host, layout.scene.timestep
     speed, force, activation = (
         max(largest(getattr(ours, name)), largest(getattr(theirs, name))) for name in ("qvel", "warmstart", "act")
     )
+    force = max(force, driven)
     speed = max(speed, timestep * force)
     still = np.zeros(host.nv)  # angular velocities that MJX treats as zero
     for _, _, first in quaternions(host):

@@ -102,8 +102,9 @@ def test_at_rest_rounding_is_all_that_moves() -> None:
     after = engine.after(state)
     still = dataclasses.replace(after, qvel=1e-13 * after.qvel, warmstart=1e-13 * after.warmstart, qpos=state.qpos)
     off = dataclasses.replace(still, qvel=1.001 * still.qvel)
-    for noise, verdict in ((0.0, "value"), (1e-15, "")):
-        found = compare_values(layout(), engine, state, off, still, stages_of(engine, state), noise)
+    for driven, noise, verdict in ((1e-13, 0.0, "value"), (1e-13, 1e-15, ""), (1.0, 0.0, "")):
+        stages = stages_of(engine, state) | {"qacc_smooth": driven * after.warmstart}
+        found = compare_values(layout(), engine, state, off, still, stages, noise)
         assert (found.stock > 1e-8) == bool(verdict)
 
 
@@ -248,7 +249,8 @@ def test_mjx_stops_what_turns_slower_than_it_sees(speed: float, verdict: str | N
     state = at([1.0, 0.0, 0.0, 0.0], [speed, 0.0, 0.0])
     after = EngineStep(own, None).after(state)
     stopped = dataclasses.replace(after, qpos=state.qpos)
-    assert compare_values(own, EngineStep(own, None), state, after, stopped, {}).verdict == verdict
+    stages = {"qacc_smooth": np.zeros(3)}
+    assert compare_values(own, EngineStep(own, None), state, after, stopped, stages).verdict == verdict
 
 
 RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .099"><freejoint/>
