@@ -148,8 +148,8 @@ class StepCheck:
         modes: difference between reverse and forward mode.
         differences: error of derivatives with respect to state and control, by central differences.
         parameters: error of derivatives with respect to contact parameters; None without contacts.
-        stock_step: difference of the next state from that of `mjx.step`, relative to what its forces cause; None if its law
-            is not MuJoCo's.
+        stock_step: difference of the next state from that of `mjx.step`, relative to what its forces cause; None if its
+            law is not MuJoCo's.
         engine_step: difference of the next state from the C engine's, likewise.
         engine: difference of the Jacobian from the C engine's where the steps agree; None if they never do.
         stock: error of the derivative of `mjx.step`; None if not requested, infinite if NaN.
