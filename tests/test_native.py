@@ -27,7 +27,7 @@ from mjx_study.graph.nodes import ELEMENTWISE
 from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation.dynamics import initial_state, step
 from mjx_study.simulation.scene import put_scene
-from tests.test_graph import FUNCTIONS, ROW
+from tests.test_graph import FUNCTIONS, ROW, descent
 
 pytestmark = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
 
@@ -170,7 +170,9 @@ def test_operations_of_integers(kind):
     compare_table(WHOLE, lambda name: square(np.array(INTEGERS).astype(kind)))
 
 
-@pytest.mark.parametrize("name", ["loops", "several computed indices", "whole arrays", "computed slice"])
+@pytest.mark.parametrize(
+    "name", ["loops", "loop of known length", "several computed indices", "whole arrays", "computed slice"]
+)
 @pytest.mark.parametrize("most", [10, 60])
 def test_long_functions_are_divided(monkeypatch, name, most):
     """And their parts compiled in several files."""
@@ -348,7 +350,7 @@ def test_kernels_compute_what_their_graph_does(long: bool, monkeypatch: pytest.M
     count, blocks = 300, 2 if long else 3
     points = np.random.default_rng(0).standard_normal((count, 3))
     several = "elementwise", "integers", "loops", "loop in a loop of members", "several computed indices", "constants"
-    plain = lambda x: [FUNCTIONS[name](x) for name in several]  # noqa: E731
+    plain = lambda x: [descent(ROW + x / 9), *(FUNCTIONS[name](x) for name in several)]  # noqa: E731
     function = capture(plain, jax.ShapeDtypeStruct((3,), float), most=9999)
     source = c.source_of(function, "gpu")
     assert (source.count("PART void part") > 2) == long

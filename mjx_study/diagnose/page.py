@@ -167,6 +167,6 @@ def _unresolved(found: Diagnosis) -> str:
     other = "larger" if found.surest.estimator == "zobg" else "smaller"
     return (
         f"the gradient is not significantly different from 0: its norm is "
-        f"{with_error(found.surest.norm, found.norm_error)}; {needed} would resolve one of {found.norm:.1g}, "
-        f"and a {other} --sigma may need fewer"
+        f"{with_error(found.surest.norm, found.norm_error)}; {needed} would resolve one of {found.norm:.1g} by "
+        f"{found.surest.estimator}, and a {other} --sigma may need fewer"
     )

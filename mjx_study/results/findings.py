@@ -30,7 +30,7 @@ LEAST_SPREAD: Final = 0.75
 """Standard deviation of the first onset's step from which an onset term is accurate to 1.5 % of what it adds; at 0.5
 it can be off by 60 %."""
 BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not significantly different from ZoBG's"
-UNKNOWN: Final = "undecided (too few effective samples)"
+UNKNOWN: Final = "not comparable with ZoBG's (too few effective samples)"
 """Verdicts on FoBG's variance."""
 BOUND: Final = "its bound gamma is below epsilon, the radius of ZoBG's mean; increase --gamma or --samples"
 ABOVE_START: Final = "use a lower --learning-rate, or check by diagnose whether the mean is right"
