@@ -180,7 +180,7 @@ FINDINGS: dict[str, tuple[list[dict[str, Any]], list[str]]] = {
     ),
     "few samples vary little": (
         [row("zobg", 10, 100), *fobg(effective_samples=2.0, debiased_error_se=0.01)],
-        ["FoBG's variance is undecided .too few effective samples. at K = 10 N/m"],
+        ["FoBG's variance is not comparable with ZoBG's .too few effective samples. at K = 10 N/m"],
     ),
     "what noise explains": (fobg(relative_error=0.044, bias_p_value=0.002), []),
     "bias": (fobg(relative_error=0.044, bias_p_value=0.001), ["biased by 4.4 ± 0 % at K = 10"]),
