@@ -6,6 +6,7 @@ The C engine's step differs in a quantity, the first of which explains later one
 import copy
 import dataclasses
 from collections import defaultdict
+from functools import partial
 from typing import Any, Final
 
 import mujoco
@@ -83,8 +84,8 @@ def compare_values(
         noise: rounding noise of each output; at rest, all of its change.
     """
     theirs = engine_step.after(state)
-    driven = largest(stages["qacc_smooth"])
-    gaps = [_apart(layout, state, ours, other, driven, noise) for other in (stock, theirs)]
+    apart = partial(_apart, layout, state, driven=largest(stages["qacc_smooth"]), noise=noise)
+    gaps = [apart(ours, other) for other in (stock, theirs)]
     from_stock, from_engine = (float(gap.max()) for gap in gaps)
     verdict, cause = None, ""
     if not np.all(np.isfinite(ours.warmstart)):
@@ -94,11 +95,7 @@ def compare_values(
         if from_engine <= TOLERANCE:
             cause = "mjx.step differs from the step of this project and the C engine"
         else:
-            third = (
-                "mjx.step"
-                if float(_apart(layout, state, stock, theirs, driven, noise).max()) <= TOLERANCE
-                else "neither"
-            )
+            third = "mjx.step" if float(apart(stock, theirs).max()) <= TOLERANCE else "neither"
             cause = f"this project's step is not that of mjx.step; the C engine agrees with {third}"
     elif not from_engine <= TOLERANCE:
         cause, documented = difference_of_engines(engine_step.host, state, stages, ours.warmstart, theirs.warmstart)
@@ -120,6 +117,7 @@ def _apart(
     before: HostState,
     ours: HostState,
     theirs: HostState,
+    *,
     driven: float,
     noise: Float[np.ndarray, " outputs"] | float,
 ) -> Float[np.ndarray, " outputs"]:

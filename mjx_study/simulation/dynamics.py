@@ -547,10 +547,9 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Control)
     fourth = slopes(*moved(1.0, third))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
     qpos, qvel, _ = moved(1.0, mean)
-    qacc = first[1]
     if state.act.size == 0:
-        return State(qpos, qvel, state.act, qacc)
+        return State(qpos, qvel, state.act, first[1])
     # MJX's own activation update, with its clamping
     data = smooth_stages(scene, model, state, control)
     act = mjx.euler(model, data.replace(act_dot=mean[2], qacc=data.qacc_smooth)).act
-    return State(qpos, qvel, act, qacc)
+    return State(qpos, qvel, act, first[1])
