@@ -40,6 +40,12 @@ UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices|async_dispatch")
 """JAX settings that traces do not depend on."""
 GRAPHS: Final = "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
 """Operations that XLA records in CUDA graphs: its default ones and whole loops, whose steps the host would launch."""
+OPTIONS: Final[dict[str, tuple[str, str]]] = {
+    "gpu": ("xla_gpu_enable_command_buffer", GRAPHS),
+    "cpu": ("xla_cpu_scheduler_type", "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"),
+}
+"""XLA's options for programs, by backend. On CPUs operations run one after the other where they can: threads call
+several programs at once already, and LAPACK calls would wait for each other (`runtime.configure`)."""
 
 LOST_CALL: Final = "No registered implementation for untyped custom call"
 """XLA's message for a call of native code whose type it has lost, as it does in some large programs."""
@@ -259,18 +265,18 @@ class _CallingAny(Sequence[jax.export.DisabledSafetyCheck]):
 
 @cache
 def compiler_options() -> dict[str, Any] | None:
-    """XLA's options for programs of this process: `GRAPHS` on GPUs, unless XLA_FLAGS says what to record.
+    """XLA's options for programs of this process: `OPTIONS`, unless XLA_FLAGS has them.
 
     None on other devices, and if this version of XLA does not know the options.
     """
-    option = "xla_gpu_enable_command_buffer"
-    if jax.default_backend() != "gpu" or option in os.environ.get("XLA_FLAGS", ""):
+    option, value = OPTIONS.get(jax.default_backend(), ("", ""))
+    if not option or option in os.environ.get("XLA_FLAGS", ""):
         return None
     try:
-        jax.jit(lambda x: x + 1, compiler_options={option: GRAPHS}).lower(1.0).compile()
+        jax.jit(lambda x: x + 1, compiler_options={option: value}).lower(1.0).compile()
     except jax.errors.JaxRuntimeError:
         return None
-    return {option: GRAPHS}
+    return {option: value}
 
 
 def type_of(leaf: Any) -> jax.ShapeDtypeStruct:

@@ -24,14 +24,18 @@ _CORES: Final[list[int]] = []
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _KEPT = -1, -3, 1 << 30  # parameters of `mallopt`, and their value [bytes]
 _POOL: Final = "PJRT_NPROC"
 """Environment variable with the size of XLA's thread pools; read when JAX sets up its devices."""
+THREADS: Final = 4
+"""Threads of XLA's pool for each core, so that one is free whatever waits: a program has few LAPACK calls at once."""
+SPLITTING: Final = "MJX_STUDY_THREADS"
+"""Environment variable with the maximum number of threads over which a call of native code is split."""
 
 
 def configure(*, precision: str = "float64", cpu_devices: int | None = None, cache: str | Path | None = None) -> None:
     """Set up JAX for a study and send MuJoCo's warnings to standard error; call before creating any array.
 
-    On CPUs a program runs in the thread that calls it, and batches call it from several threads (`local_devices`).
-    XLA's own pool gets a single thread: jaxlib 0.10 splits LAPACK calls of 200,000 operations or more over it and waits
-    inside it for the parts, for ever if as many calls wait as it has threads.
+    On CPUs batches call a program from as many threads as there are cores (`local_devices`), and XLA's pool runs some
+    of its operations. jaxlib 0.10 splits LAPACK calls of 200,000 operations or more over that pool and waits inside it
+    for the parts, for ever if as many calls wait as it has threads: there it gets `THREADS` for each core.
 
     Args:
         precision: float64 or float32. Stiff contact needs float64: equivalent float32 programs of one rollout differ in
@@ -50,10 +54,11 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
         raise ValueError(f"cpu_devices must be at least 1, got {cores}")
     mujoco.set_mju_user_warning(print_warning)  # not a file in the current folder
     jax.config.update("jax_enable_x64", precision == "float64")
-    jax.config.update("jax_num_cpu_devices", 1)  # XLA's pool has at least one thread per device
+    jax.config.update("jax_num_cpu_devices", 1)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    if not _CORES and jax.default_backend() == "cpu":
-        _shrink_pool()
+    os.environ.setdefault(SPLITTING, "1")  # batches are spread already
+    if not _CORES and jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11):
+        _enlarge_pool()
     _keep_memory()
     _CORES[:] = [cores]
     _keep_programs(cache)
@@ -100,16 +105,16 @@ def _keep_memory() -> None:
         libc.mallopt(_MMAP_THRESHOLD, _KEPT)
 
 
-def _shrink_pool() -> None:
-    """Set up JAX's CPU again, with a pool of one thread. Accelerators keep theirs, which compile their programs."""
+def _enlarge_pool() -> None:
+    """Set up JAX's CPU again, with a pool of `THREADS` per core, unless the environment says how many."""
+    if _POOL in os.environ:
+        return
     clear_backends()
-    before = os.environ.get(_POOL)
-    os.environ[_POOL] = "1"
+    os.environ[_POOL] = str(THREADS * max(2, available_cores()))
     try:
         jax.local_devices()
     finally:
         del os.environ[_POOL]
-        os.environ.update({} if before is None else {_POOL: before})
 
 
 def local_devices() -> list[Any]:

@@ -222,7 +222,8 @@ def test_a_bias_at_right_angles_to_the_gradient_is_seen() -> None:
 @pytest.mark.parametrize(
     ("spread", "strength", "expected"),
     [
-        (0.3, 0.5, "for fobg_onset and aobg_onset the noise is too narrow"),
+        (0.3, 0.5, "for fobg_onset and aobg_onset the noise is too narrow: take --timestep 0.0008 or --sigma 0.2"),
+        (0.0, 0.5, "the noise is too narrow: take a larger --sigma, or noise on the start"),
         (2.0, 0.5, "can be off by 25 %"),
         (2.0, 0.05, None),
         (2.0, 1.2, "can leave more than it adds"),

@@ -25,6 +25,7 @@ from mjx_study.graph.function import capture
 from mjx_study.graph.native import SWITCH, computes_steps, native_identity, native_summary
 from mjx_study.graph.nodes import ELEMENTWISE
 from mjx_study.graph.scalars import unrolled
+from mjx_study.runtime import SPLITTING
 from mjx_study.simulation.dynamics import initial_state, step
 from mjx_study.simulation.scene import put_scene
 from tests.test_graph import FUNCTIONS, ROW, descent
@@ -193,6 +194,26 @@ def test_what_a_sample_gives_depends_on_no_other():
     np.testing.assert_array_equal(jax.jit(lambda x: unrolled(FUNCTIONS["loops"], x))(points[5])[0], roots[5])
 
 
+@pytest.mark.parametrize("samples", [4803, 4800, 8 * 4803])
+def test_threads_share_large_batches(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bitwise the same, also where the last vector overlaps another share's, and with an input that all share."""
+
+    def function(x, y):
+        for _ in range(500):
+            x = jnp.sin(x) + y
+        return x, x[:1] > 0
+
+    program = jax.jit(jax.vmap(lambda x, y: unrolled(function, x, y), (0, None)))
+    points = np.random.default_rng(0).normal(size=(samples, 1))
+    monkeypatch.setenv(SPLITTING, "1")
+    alone = program(points, ROW[:1])
+    for threads in (2, 3, 100):
+        monkeypatch.setenv(SPLITTING, str(threads))
+        for _ in range(5):
+            for ours, theirs in zip(program(points, ROW[:1]), alone, strict=True):
+                np.testing.assert_array_equal(ours, theirs)
+
+
 def test_batches_of_batches_and_what_does_not_vary():
     def function(x, y):
         return jnp.outer(jnp.sin(x), y), jnp.sum(x) > y[0]
@@ -277,6 +298,7 @@ ALONE = """
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 from mjx_study.graph.scalars import unrolled
+from mjx_study.runtime import SPLITTING
 from mjx_study.simulation.dynamics import initial_state, step
 from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-SETTINGS = {"text": True, "env": {name: value for name, value in os.environ.items() if name != "PJRT_NPROC"}}
+POOL = "PJRT_NPROC", "MJX_STUDY_THREADS"
+SETTINGS = {"text": True, "env": {name: value for name, value in os.environ.items() if name not in POOL}}
 CALLS = """
 import sys, threading
 import jax, jax.numpy as jnp

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from mjx_study.diagnose.measurement import SAMPLES, TARGET_ERROR
-from mjx_study.diagnose.run import Diagnosis, enough, round_down, round_up
+from mjx_study.diagnose.run import Diagnosis, enough, one_digit, round_up
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
 from mjx_study.table import number, percent
 
@@ -145,8 +145,11 @@ def _onset(found: Diagnosis) -> Iterator[Advice]:
                 "",
             )
     elif spread < LEAST_SPREAD:
-        finer = f"--timestep {round_down(timestep * spread / LEAST_SPREAD)}, or " if spread > 0 else ""
-        yield f"for fobg_onset and aobg_onset the noise is too narrow: take {finer}a larger --sigma", ""
+        remedy = "a larger --sigma, or noise on the start"
+        if spread > 0:
+            share, sigma = spread / LEAST_SPREAD, found.setting.sigma
+            remedy = f"--timestep {one_digit(timestep * share)} or --sigma {one_digit(sigma / share, math.ceil)}"
+        yield f"for fobg_onset and aobg_onset the noise is too narrow: take {remedy}", ""
     elif (
         corrected.verdict == "biased"
         and corrected.bias > linear * (plain.bias + corrected.bias)
@@ -158,7 +161,7 @@ def _onset(found: Diagnosis) -> Iterator[Advice]:
             "",
         )
     elif linear > NOTABLE_SHARE:
-        step = round_down(timestep * NOTABLE_SHARE / linear)
+        step = one_digit(timestep * NOTABLE_SHARE / linear)
         yield (
             f"{linear_error(strength)}: --timestep {step} brings that down to {percent(NOTABLE_SHARE)}; the "
             "error of --onset shift does not depend on it",

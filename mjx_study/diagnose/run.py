@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Final
 
 from mjx_study.choices import is_file, takes_stiffness
@@ -79,10 +80,10 @@ def round_up(number: float) -> str:
     return f"{math.ceil(number / 10**digits) * 10**digits:,}"
 
 
-def round_down(number: float) -> str:
-    """Round down to one significant digit."""
+def one_digit(number: float, rounded: Callable[[float], int] = math.floor) -> str:
+    """Round to one significant digit, by default down."""
     unit = 10.0 ** math.floor(math.log10(number))
-    return f"{math.floor(number / unit) * unit:.1g}"
+    return f"{rounded(round(number / unit, 9)) * unit:.1g}"
 
 
 def enough(found: Measurement, factor: float) -> str:

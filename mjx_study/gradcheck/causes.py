@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mjx_study.gradcheck.coordinates import LENGTH, Coordinate, Coordinates, joint_name, joints_above, quaternions
+from mjx_study.gradcheck.differences import UNSEEN
 from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.simulation.engine import HostState, host_data
 from mjx_study.simulation.scene import num_constraint_rows
@@ -19,6 +20,9 @@ NEAR_DISTANCE: Final = 2e-6
 PARALLEL: Final = 1e-5
 """Angle [rad] or distance [m] below which directions or points coincide; contact points turn within less."""
 SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints are redundant)"
+ROUNDING_DECIDES: Final = (
+    f"rounding decides where bodies touch: the step jumps within changes of {UNSEEN:g} in its state"
+)
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 _PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
@@ -42,8 +46,8 @@ class DegenerateContact:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FindingContext:
-    """Where a finding occurs: MJX's intermediate quantities at the state, its constrained acceleration, and the
-    parameters of all geoms with the contact model applied."""
+    """Where a finding occurs: MJX's intermediate quantities at the state, its constrained acceleration, the parameters
+    of all geoms with the contact model applied, and how far outputs jump by rounding."""
 
     layout: Coordinates
     state: HostState
@@ -51,6 +55,7 @@ class FindingContext:
     qacc: Float[np.ndarray, " nv"]
     solref: Float[np.ndarray, "geoms 2"]
     solimp: Float[np.ndarray, "geoms 5"]
+    unsteady: Float[np.ndarray, " outputs"]
 
     @property
     def host(self) -> mujoco.MjModel:
@@ -167,6 +172,8 @@ def _kinks(context: FindingContext, output: Coordinate, source: Coordinate) -> I
     if np.any(host.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE):
         yield "a muscle's activation or velocity is where its curves change"
     yield from (contact.cause for contact in context.degenerate if contact.concerns(output, source))
+    if context.unsteady[context.layout.outputs.index(output)]:
+        yield ROUNDING_DECIDES
     yield "a clip, a maximum or a choice between features switches here"
 
 

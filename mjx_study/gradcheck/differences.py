@@ -19,6 +19,9 @@ SIZES: Final = tuple(2.5e-4 / RATIO**power for power in range(8))
 """Step sizes [m, rad, ...], down to 1.5e-8; the finest smooth structure of MuJoCo's contact is 1 mm."""
 ROUNDING: Final = 1e-13  # relative rounding noise of a step's output, solved to rounding
 EPSILON: Final = 1e-15  # a few rounding errors of a float64
+UNSEEN: Final = 1e-13
+"""Change of the inputs that no number of a user's depends on, though a few hundred rounding errors of a float64."""
+UNSEEN_MOVES: Final = 64
 SMOOTH, KINK = 1.5, 0.5  # powers of h between which the second difference indicates a kink, whose power is 1
 
 
@@ -46,6 +49,11 @@ class Differences:
     @property
     def rough(self) -> Bool[np.ndarray, "outputs columns"]:
         return self.kink | self.jump | self.nearby
+
+    def jumping(self, outputs: Bool[np.ndarray, " outputs"]) -> "Differences":
+        """The same where some outputs jump at the state."""
+        rows = np.broadcast_to(outputs[:, None], self.jump.shape)
+        return dataclasses.replace(self, jump=self.jump | rows, kink=self.kink & ~rows, nearby=self.nearby & ~rows)
 
 
 def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "moves inputs"]:
@@ -104,6 +112,25 @@ def _falloff(amount: Float[np.ndarray, "sizes columns outputs"], noise: Float[np
     finest = last[0] >= len(usable) - 2
     here_too = finest | (following > expected / RATIO) | (expected <= 200 * noise)
     return power, over_size, here_too
+
+
+def unseen_moves(inputs: int) -> Float[np.ndarray, "moves inputs"]:
+    """Changes of all inputs at once by up to `UNSEEN`, down to rounding."""
+    directions = np.random.default_rng(0).uniform(-1, 1, (UNSEEN_MOVES, inputs))
+    return np.geomspace(1e-15, UNSEEN, UNSEEN_MOVES)[:, None] * directions
+
+
+def unsteady_outputs(
+    here: Float[np.ndarray, " outputs"],
+    around: Float[np.ndarray, "moves outputs"],
+    jacobian: Float[np.ndarray, "outputs inputs"],
+    noise_floor: Float[np.ndarray, " outputs"] | float = 0.0,
+) -> Float[np.ndarray, " outputs"]:
+    """How far outputs jump within changes of `UNSEEN`, where rounding decides; 0 for those that do not."""
+    apart = np.abs(around - here).max(axis=0)
+    sloped = UNSEEN * np.nan_to_num(np.abs(jacobian), posinf=0.0).sum(axis=1)
+    expected = ROUNDING * np.maximum(np.abs(here), 1e-2) + noise_floor + sloped
+    return np.where(apart > 1000 * expected, apart, 0.0)
 
 
 def solution_noise(

@@ -7,11 +7,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_study.gradcheck import diagnosis
-from mjx_study.gradcheck.causes import SINGULAR, FindingContext, cause_of_fault, cause_of_kink
+from mjx_study.gradcheck.causes import ROUNDING_DECIDES, SINGULAR, FindingContext, cause_of_fault, cause_of_kink
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.coverage import Coverage
-from mjx_study.gradcheck.diagnosis import ENGINE, NAN, RIGHT, UNRESOLVED, VERDICTS, Codes, judge, worst_error
-from mjx_study.gradcheck.differences import Differences, moves, solution_noise, take_differences
+from mjx_study.gradcheck.diagnosis import (
+    ENGINE,
+    JUMP,
+    NAN,
+    RIGHT,
+    UNRESOLVED,
+    VERDICTS,
+    Codes,
+    judge,
+    worst_error,
+)
+from mjx_study.gradcheck.differences import (
+    Differences,
+    moves,
+    solution_noise,
+    take_differences,
+    unseen_moves,
+    unsteady_outputs,
+)
 from mjx_study.gradcheck.engine_step import EngineStep
 from mjx_study.gradcheck.programs import ContactCase, Programs
 from mjx_study.gradcheck.report import Entry, Finding, StepCheck
@@ -68,20 +85,23 @@ def check_state(
     ladder = moves(np.eye(len(layout.inputs)))
     qacc = programs.exact(case, sample.state, reference, ladder[:1]).after.warmstart
     solved = dataclasses.replace(sample.state, warmstart=qacc)
-    exact = programs.exact(case, solved, reference, ladder)
+    unseen = unseen_moves(len(layout.inputs))
+    exact = programs.exact(case, solved, reference, np.concatenate([ladder, unseen]))
+    outputs, around = np.split(exact.outputs, [len(ladder)])
     noise = solution_noise(layout, exact.stages, qacc)
-    truth = take_differences(exact.outputs, noise)
+    unsteady = unsteady_outputs(outputs[0], around, linear.forward, noise)
+    truth = take_differences(outputs, noise).jumping(unsteady > 0)
     values = engine_truth = None
     if has_mujoco_law(case.contact):
         engine_truth = take_differences(
             engine_step.outputs(solved, linear.qpos, ladder), engine_step.noise(solved, linear.qpos)
         )
         stock_step = programs.stock_step(case, solved)
-        values = compare_values(layout, engine_step, solved, exact.after, stock_step, exact.stages, noise)
+        values = compare_values(layout, engine_step, solved, exact.after, stock_step, exact.stages, noise + unsteady)
 
     model = apply_contact(layout.scene.model, case.contact)
     solref, solimp = np.asarray(model.geom_solref), np.asarray(model.geom_solimp)
-    context = FindingContext(layout, sample.state, exact.stages, qacc, solref, solimp)
+    context = FindingContext(layout, sample.state, exact.stages, qacc, solref, solimp, unsteady)
     degenerate = np.array(
         [
             [any(contact.concerns(output, source) for contact in context.degenerate) for source in layout.inputs]
@@ -90,7 +110,7 @@ def check_state(
     )
     derivatives = {"forward": linear.forward, "reverse": linear.reverse}
     derivatives |= {} if linear.tape is None else {"tape": linear.tape}
-    excused = degenerate & truth.rough
+    excused = (degenerate | (unsteady > 0)[:, None]) & truth.rough
     others = list(derivatives.values())[1:]
     apart = max(diagnosis.modes_apart(layout, linear.forward, other, excused) for other in others)
     converged = None if linear.residual <= 1e-10 else programs.linear(case, solved).forward
@@ -197,7 +217,9 @@ def _of_engine(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind, 
 
 
 def _of_state(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind, Entry]]:
-    values = check.values
+    values, unsteady = check.values, check.context.unsteady
+    if unsteady.any() and not any((codes == JUMP).any() for codes in check.of("project").values()):
+        yield ("project", VERDICTS[JUMP], (), ROUNDING_DECIDES), check.entry("", float(unsteady.max()))
     if not check.residual <= diagnosis.RESIDUAL_TOLERANCE:
         cause = f"residual {check.residual:.1e}; {_budget(layout)}"
         yield ("project", "unconverged", (), cause), check.entry("", check.residual)

@@ -87,6 +87,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | 
             f"#define OUTPUTS {_forms(outputs)}",
             f"#define BYTES {sum(aval.size * aval.dtype.itemsize for aval in (*inputs, *outputs))}",
             f"#define KEPT {num_kept}",
+            f"#define OPERATIONS {max(1, function.size) * (1 if passes is None else passes.length)}L",
             _text("prelude.c"),
             _text("functions.c"),
             *writer.tables,

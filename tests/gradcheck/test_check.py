@@ -10,6 +10,7 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.gradcheck import Finding, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
+from mjx_study.gradcheck.causes import ROUNDING_DECIDES
 from mjx_study.simulation import dynamics
 from mjx_study.simulation.scene import load_scene
 from mjx_study.tasks import make_task
@@ -94,6 +95,27 @@ def test_a_jump_is_not_a_wrong_derivative() -> None:
     jump = only(report, "jump")
     assert "floor and ball is at its onset" in jump.cause, jump.cause
     assert report.passed and "d qvel[z] / d qpos[z]" in {entry.name for entry in jump.entries}
+
+
+LYING = """
+<option timestep="0.002"/>
+<worldbody>
+  <geom name="log" type="cylinder" size=".2 .5" euler="{log}"/>
+  <body pos="0 0 .245">
+    <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+    <joint name="turn" type="hinge" axis="0 1 0"/>
+    <geom name="bar" type="{kind}" size=".05 .2" euler="{bar}" mass="1"/>
+  </body>
+</worldbody>
+"""
+
+
+@pytest.mark.slow
+def test_rounding_decides_where_rollers_touch() -> None:
+    """Anywhere along the line: two programs of the same step differ, as do its two modes, and neither is wrong."""
+    report = check(LYING.format(kind="cylinder", log="90 0 0", bar="90 0 0"), states=40)
+    causes = {finding.cause: len(finding.entries) for finding in report.findings if finding.verdict == "jump"}
+    assert causes[ROUNDING_DECIDES] > 100 and report.passed, report.lines()
 
 
 def test_a_control_at_its_bound_is_a_kink() -> None:

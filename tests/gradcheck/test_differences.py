@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 
 from mjx_study.gradcheck.coordinates import make_coordinates
-from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, moves, solution_noise, take_differences
+from mjx_study.gradcheck.differences import (
+    RATIO,
+    SIZES,
+    UNSEEN,
+    Differences,
+    moves,
+    solution_noise,
+    take_differences,
+    unseen_moves,
+    unsteady_outputs,
+)
 from mjx_study.gradcheck.programs import ContactCase, Programs
 from mjx_study.simulation.engine import HostState
 from tests.scenes import scene_of
@@ -89,6 +99,18 @@ def test_rounding_is_not_a_jump() -> None:
     found = read(lambda x: np.ones_like(x), noise=1e-16)
     assert not found.jump[0, 0] and not found.kink[0, 0]
     assert abs(found.value[0, 0]) <= found.uncertainty[0, 0]
+
+
+def test_what_jumps_within_rounding_is_unsteady() -> None:
+    """A steep output and one with rounding of its own are not, nor one that jumps farther away."""
+    moves = unseen_moves(2)
+    assert np.abs(moves).max() <= UNSEEN and np.linalg.matrix_rank(moves) == 2
+    noise = np.array([0.0, 0.0, 1e-9, 0.0])
+    outputs = lambda at: np.array([1e-6 * (at[0] > 2e-14), 1e6 * at[1], 1e-9 * np.sign(at[0]), at[0] > 1e-12])  # noqa: E731
+    around = np.array([outputs(each) for each in moves])
+    jacobian = np.array([[0.0, 0.0], [0.0, 1e6], [0.0, 0.0], [0.0, 0.0]])
+    found = unsteady_outputs(outputs(np.zeros(2)), around, jacobian, noise)
+    np.testing.assert_allclose(found, [1e-6, 0, 0, 0])
 
 
 def test_the_ladder_ends_below_what_a_contact_can_show() -> None:
