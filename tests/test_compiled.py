@@ -259,16 +259,19 @@ def test_names_say_which_settings_do_not_count():
     ], left_out
 
 
-def test_gpu_programs_run_whole_loops_in_graphs_unless_xla_flags_say_otherwise(monkeypatch: pytest.MonkeyPatch):
-    assert compiled.compiler_options.__wrapped__() is None
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    options = compiled.compiler_options.__wrapped__()
-    assert options is not None  # this XLA knows the names
-    assert "WHILE" in ",".join(options.values())
-    with monkeypatch.context() as patch:
-        patch.setenv("XLA_FLAGS", "--xla_gpu_enable_command_buffer=")
+def test_programs_have_options_unless_xla_flags_say_otherwise(monkeypatch: pytest.MonkeyPatch):
+    for backend, part in (("cpu", "MEMORY"), ("gpu", "WHILE")):
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        options = compiled.compiler_options.__wrapped__()
+        assert options is not None  # this XLA knows the names
+        ((option, value),) = options.items()
+        assert part in value
+        with monkeypatch.context() as patch:
+            patch.setenv("XLA_FLAGS", f"--{option}=")
+            assert compiled.compiler_options.__wrapped__() is None
+        monkeypatch.setitem(compiled.OPTIONS, backend, (option, "OF_ANOTHER_VERSION"))
         assert compiled.compiler_options.__wrapped__() is None
-    monkeypatch.setattr(compiled, "GRAPHS", "FUSION,OF_ANOTHER_VERSION")
+    monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
     assert compiled.compiler_options.__wrapped__() is None
 
 

@@ -1,4 +1,4 @@
-"""No computation stands still for ever: LAPACK calls never wait for each other, and a watchdog ends what does."""
+"""Threads compute side by side, LAPACK calls do not wait for each other for ever, a watchdog ends what stands still."""
 
 import os
 import signal
@@ -26,6 +26,45 @@ threads = [threading.Thread(target=lambda: jax.device_get(program(matrices)), da
 [thread.start() for thread in threads]
 [thread.join() for thread in threads]
 print("done")
+"""
+SIDE_BY_SIDE = """
+import threading
+from pathlib import Path
+import jax, jax.numpy as jnp
+from mjx_study.graph.scalars import unrolled
+from mjx_study.runtime import configure
+
+def used():  # processor time by thread
+    stats = {each.name: (each / "stat").read_text() for each in Path("/proc/self/task").iterdir()}
+    fields = {name: each.rpartition(")")[2].split() for name, each in stats.items()}
+    return {name: int(each[11]) + int(each[12]) for name, each in fields.items()}
+
+def heavy(x):
+    for _ in range(300):
+        x = jnp.sin(x) + 0.1
+    return x
+
+def step(x, _):
+    return unrolled(heavy, x), (x, jnp.stack([2 * x, x]), jnp.linalg.norm(jnp.stack([x, x * x])))
+
+configure(cpu_devices=2)
+points = jnp.linspace(0, 1, 2000)
+program = jax.jit(jax.vmap(lambda x: jax.lax.scan(step, x, None, length=100))).lower(points).compile()
+jax.device_get(program(points))
+before, met = used(), threading.Barrier(3)
+
+def work():
+    for _ in range(5):
+        jax.device_get(program(points))
+    met.wait()
+    met.wait()
+
+for _ in range(2):
+    threading.Thread(target=work).start()
+met.wait()
+spent = [ticks - before.get(name, 0) for name, ticks in used().items()]
+met.wait()
+print(max(spent) / sum(spent))
 """
 WATCHED = """
 import sys, time
@@ -76,6 +115,11 @@ def run(script: str, *arguments: str, seconds: float = 120) -> subprocess.Comple
 def test_lapack_calls_side_by_side_end() -> None:
     """Two threads with programs of 16 factorisations each, all of which jaxlib 0.10 would split."""
     assert run(CALLS, "configured").stdout == "done\n"
+
+
+def test_programs_of_several_threads_run_side_by_side() -> None:
+    """No thread does nearly all of the work, as one did for everybody when XLA's pool had no other."""
+    assert float(run(SIDE_BY_SIDE).stdout) < 0.7
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="a pool of one thread does not split LAPACK calls")
