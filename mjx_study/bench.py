@@ -4,7 +4,7 @@ The baselines use the same policy, initial states, noise, devices and precision,
 than MuJoCo's, which they lack:
 
 - stock MJX: `jax.grad` through `mjx.step` with a single solver iteration, all that reverse mode allows (so its gradient
-  is not that of the converged step), in batches that fit in memory;
+  is not that of the converged step), in batches that fit in memory, on as many threads as are fastest;
 - the C engine's rollouts: `mujoco.rollout`, open loop, in float64, on as many threads as there are devices or cores;
 - the C engine's gradients: centred `mjd_transitionFD` at every step and an adjoint sweep, measured on one thread and
   scaled by the number of devices, as if threading were free; not with quaternions or RK4, which it cannot
@@ -14,7 +14,8 @@ than MuJoCo's, which they lack:
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final
 
 import jax
@@ -212,17 +213,31 @@ def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples:
     while True:
         value, gradient = stock_programs(task, contact, keys[:samples], devices)
         try:
-            jax.block_until_ready(gradient())
+            jax.block_until_ready(gradient(devices))
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error) or samples <= len(devices):
                 raise
             samples //= 2
         else:
-            return samples, value, gradient
+            return samples, *(_on_fastest(call, devices) for call in (value, gradient))
 
 
-def stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices: Any) -> tuple[Callable[[], Any], ...]:
-    """Programs for costs and gradients of the same samples through `mjx.step`, spread like this project's."""
+def _on_fastest(call: Callable[[Any], Any], devices: Sequence[Any]) -> Callable[[], Any]:
+    """A call on those numbers of threads that is fastest on a CPU, of all, a quarter and so on: stock MJX's hinder each
+    other from some number on."""
+    choices = [devices]
+    while len(choices[-1]) > 1 and devices[0].platform == "cpu":
+        choices.append(devices[: max(1, len(choices[-1]) // 4)])
+    jax.block_until_ready(call(devices))
+    fastest = min(choices, key=lambda some: _seconds(lambda: call(some)))
+    return lambda: call(fastest)
+
+
+def stock_programs(
+    task: Task, contact: ContactModel | None, keys: Any, devices: Sequence[Any]
+) -> tuple[Callable[[Any], Any], ...]:
+    """Programs for costs and gradients of the same samples through `mjx.step`, split into as many calls as there are
+    devices, and made on those given."""
     scene, policy = task.scene, task.policy
     dtype = scene.template.qpos.dtype
 
@@ -253,7 +268,7 @@ def stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices:
     values, gradients = (Compiled(jax.vmap(each, (None, None, 0))) for each in (stock_rollouts, stock_gradients))
     shared, rows = (task.theta, contact), (np.asarray(jax.random.key_data(keys)),)
     chunk = -(-len(keys) // len(devices))
-    return tuple((lambda run=run: spread(run, shared, rows, chunk, devices)) for run in (values, gradients))
+    return tuple(partial(spread, run, shared, rows, chunk) for run in (values, gradients))
 
 
 def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:

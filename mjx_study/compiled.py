@@ -102,9 +102,11 @@ class Compiled:
     def within(self, *arguments: Any) -> Callable[..., Any]:
         """The function for use within another program that JAX's default backend runs: its cached trace, which cannot
         be batched or differentiated, or else `jitted`."""
-        ready: Any = self._prepared(*self._form(arguments), arguments)
-        whole = isinstance(ready, jax.stages.Compiled) or ready is self._whole
-        return self.jitted if whole else jax.jit(ready.__wrapped__)  # without XLA's options, which are the other's
+        ready = self._prepared(*self._form(arguments), arguments)
+        if isinstance(ready, jax.stages.Compiled) or ready is self._whole:
+            return self.jitted
+        loaded: Any = ready
+        return jax.jit(loaded.__wrapped__)  # XLA's options are those of the other program
 
     def outputs(self, *arguments: Any, platform: str | None = None) -> Any:
         """Shapes and types of the outputs, without running the function; see `prepare` for the arguments."""

@@ -24,7 +24,7 @@ _CORES: Final[list[int]] = []
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _KEPT = -1, -3, 1 << 30  # parameters of `mallopt`, and their value [bytes]
 _POOL: Final = "PJRT_NPROC"
 """Environment variable with the size of XLA's thread pools; read when JAX sets up its devices."""
-THREADS: Final = 8
+THREADS: Final = 4
 """Threads of XLA's pool for each core, so that one is free whatever waits: a program has few LAPACK calls at once."""
 SPLITTING: Final = "MJX_STUDY_THREADS"
 """Environment variable with the maximum number of threads over which a call of native code is split."""
