@@ -26,7 +26,7 @@ from experiments import DATA, DOCS, append_line, read_lines
 from experiments.pages import write_tables
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
 from mjx_study.diagnose.measurement import ESTIMATORS, measure
-from mjx_study.experiment.reference_gradient import reference_of
+from mjx_study.experiment.reference_gradient import candidates_of, reference_of
 from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
 from mjx_study.runtime import configure, local_devices
@@ -107,7 +107,8 @@ def reference(objective: MjxObjective, key: Any) -> GradientEstimate:
     )
     task = objective.simulator.task
     other = jnp.median(objective.differentiate_corrected(task.theta, jax.random.clone(candidate)).gradient, axis=0)
-    return reference_of(task, objective, odd, candidate, objective.evaluate(task.theta, pilot), other)
+    candidates = candidates_of(task, objective, candidate, other)
+    return reference_of(task, objective, odd, objective.evaluate(task.theta, pilot), candidates)
 
 
 def measured(objective: MjxObjective, size: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:

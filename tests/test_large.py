@@ -167,7 +167,7 @@ def test_the_first_samples_pick_the_control_variate(monkeypatch: pytest.MonkeyPa
     reference_of = gradients.reference_of
     monkeypatch.setattr(gradients, "PILOT", 12)
     monkeypatch.setattr(
-        gradients, "reference_of", lambda *args: sizes.append(len(args[4].value)) or reference_of(*args)
+        gradients, "reference_of", lambda *args: sizes.append(len(args[3].value)) or reference_of(*args)
     )
     found = [numbers_of(plan)["reference"] for plan in (planned(), planned(block_size=None))]
     assert sizes == [12, 12]

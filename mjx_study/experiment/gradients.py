@@ -26,7 +26,14 @@ from mjx_study.compiled import Builds, type_of
 from mjx_study.experiment import gradient_numbers, memory
 from mjx_study.experiment.gradient_numbers import MOST_KEPT, cell_numbers, estimate_numbers, seed_numbers
 from mjx_study.experiment.merged_samples import REFERENCE_UNIT, Blocks, pack
-from mjx_study.experiment.reference_gradient import CANDIDATES, averaged, most_parts, reference_of, soft_gradient
+from mjx_study.experiment.reference_gradient import (
+    CANDIDATES,
+    averaged,
+    candidates_of,
+    most_parts,
+    reference_of,
+    soft_gradient,
+)
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, rows_of_keys, sample_keys
 from mjx_study.experiment.study import (
     Arrays,
@@ -181,12 +188,17 @@ class GradientComputation(Computation):
     def _keys(self) -> dict[str, Any]:
         return cell_keys(self._config.seed, self._config.seeds)
 
-    def _keys_of_reference(self, index: int = 0) -> tuple[Key[Array, " pairs"], Key[Array, " samples"]]:
-        """Keys of the pairs of a part of the reference, and of the candidates, which all parts share."""
-        odd, candidate = self._keys["reference"]
-        odd = jax.random.fold_in(odd, index) if index else odd
-        pairs = self._config.settings.reference_samples
-        return jax.random.split(odd, pairs), jax.random.split(candidate, CANDIDATES)
+    def _keys_of_reference(self, index: int = 0) -> Key[Array, " pairs"]:
+        """Keys of the pairs of a part of the reference."""
+        odd = self._keys["reference"][0]
+        return jax.random.split(
+            jax.random.fold_in(odd, index) if index else odd, self._config.settings.reference_samples
+        )
+
+    @property
+    def _keys_of_candidates(self) -> Key[Array, " samples"]:
+        """Keys of the candidates, which all parts of the reference share."""
+        return jax.random.split(self._keys["reference"][1], CANDIDATES)
 
     def begin(self, cell: StudyCell, checkpoint: Checkpoint) -> Work:
         blocks = blocks_of(self._plan, cell)
@@ -328,7 +340,8 @@ class GradientComputation(Computation):
             size, drawn = self._plan.padded_samples(cell), {name: batches[name] for name in self._plan.oracles}
             drawn = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((seeds, size, *leaf.shape[1:]), leaf.dtype), drawn)
             pilot = blank.evaluate(task.theta, rows_of_keys(keys, np.zeros(min(cell.samples, PILOT), int)))
-            reference = reference_of(task, blank, *self._keys_of_reference(), pilot, None)
+            candidates = candidates_of(task, blank, self._keys_of_candidates, None)
+            reference = reference_of(task, blank, self._keys_of_reference(), pilot, candidates)
             keys = rows_of_keys(keys, slice(seeds))
             types = drawn, type_of(np.asarray(size)), jax.tree.map(type_of, reference), type_of(keys)
             self._builds.start(seed_numbers(estimators_of(self._plan, cell), config.confidence), *types)
@@ -342,13 +355,14 @@ class GradientComputation(Computation):
         softened = cell.group, cell.sigma
         if softened not in self._soft and cell.model.contact is not None:
             self._soft[softened] = soft_gradient(
-                self._objectives.simulator(cell.group), cell.sigma, self._keys_of_reference()[1]
+                self._objectives.simulator(cell.group), cell.sigma, self._keys_of_candidates
             )
         soft = None if cell.model.contact is None else self._soft[softened]
         task = self._plan.task_of(cell)
+        candidates = candidates_of(task, objective, self._keys_of_candidates, soft)
 
         def part(index: int) -> GradientEstimate:
-            return reference_of(task, objective, *self._keys_of_reference(index), pilot, soft)
+            return reference_of(task, objective, self._keys_of_reference(index), pilot, candidates)
 
         pairs = self._config.settings.reference_samples
         reference, parts = averaged(part, _parts(self._plan, task))

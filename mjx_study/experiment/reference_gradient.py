@@ -77,27 +77,37 @@ def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples
     return jnp.median(objective.differentiate(task.theta, jax.random.clone(keys)).gradient, axis=0)
 
 
+def candidates_of(
+    task: Task,
+    objective: MjxObjective | Reference,
+    keys: Key[Array, " samples"],
+    soft: Float[Array, " params"] | None,
+) -> Float[Array, "candidates params"] | None:
+    """Candidates for the reference's control variate: the median of first-order samples, and `soft_gradient`; None if
+    the reference takes none."""
+    if not isinstance(objective, MjxObjective) or not takes_candidates(task):
+        return None
+    own = jnp.median(objective.differentiate(task.theta, keys).gradient, axis=0)
+    return jnp.stack([own, jnp.zeros_like(own) if soft is None else soft])
+
+
 def reference_of(
     task: Task,
     objective: MjxObjective | Reference,
-    odd_keys: Key[Array, " pairs"],
-    candidate_keys: Key[Array, " samples"],
+    keys: Key[Array, " pairs"],
     pilot: Evaluation,
-    soft: Float[Array, " params"] | None,
+    candidates: Float[Array, "candidates params"] | None,
 ) -> GradientEstimate:
     """Return the reference gradient of a contact model, independent of which others are compared.
 
-    `candidate_keys` are those of first-order samples, whose median is a candidate for the control variate beside
-    `soft`, see `soft_gradient`; the pilot batch, which selects among them, has other keys.
+    The pilot batch selects among the candidates, see `candidates_of`; neither shares keys with the other or the pairs.
     """
-    if not isinstance(objective, MjxObjective) or not takes_candidates(task):
-        plus, minus = objective.evaluate_pair(task.theta, odd_keys)
+    if candidates is None or not isinstance(objective, MjxObjective):
+        plus, minus = objective.evaluate_pair(task.theta, keys)
         return _antithetic(plus, minus, "zero_noise")
-    own = jnp.median(objective.differentiate(task.theta, candidate_keys).gradient, axis=0)
-    candidates = jnp.stack([own, jnp.zeros_like(own) if soft is None else soft])
     padding = padded_size(len(pilot.value)) - len(pilot.value)
     pilot = jax.tree.map(lambda leaf: np.pad(leaf, [(0, padding)] + [(0, 0)] * (leaf.ndim - 1)), pilot)
-    return _reference_gradient(objective.evaluate_odd(task.theta, odd_keys), pilot, candidates, objective.sigma)
+    return _reference_gradient(objective.evaluate_odd(task.theta, keys), pilot, candidates, objective.sigma)
 
 
 def most_parts(task: Task, pairs: int) -> int:
