@@ -108,7 +108,8 @@ def _derivatives(found: Diagnosis) -> str:
 
 def _contact_lines(found: Diagnosis) -> list[str]:
     onsets = found.onsets.get("onsets", 0)
-    lines = [f"  contacts and limits that begin in a rollout with noise: {onsets / found.samples:.3g}"]
+    start = "; bodies that touch at the start do not count" if found.touches and not onsets else ""
+    lines = [f"  contacts and limits that begin in a rollout with noise: {onsets / found.samples:.3g}{start}"]
     if found.law:
         before = f" a contact begins {1e3 * found.lead:.3g} ms before touch, where it acts;" if found.lead else ""
         lines.insert(0, f"  {found.law} is not MuJoCo's law:{before} onset terms and impedance do not apply")

@@ -253,8 +253,7 @@ class GradcheckReport:
         lines += self._coverage_lines()
         lines += self._finding_lines(verbose)
         lines += [f"warning: {text}" for text in (*self.warnings, *self._gaps())]
-        told = "see above" if any(each.fails for each in self.findings) else self.reason
-        verdict = "every derivative that exists is right" if self.passed else f"SOMETHING IS WRONG: {told}"
+        verdict = "every derivative that exists is right" if self.passed else f"NOT RIGHT: {self.reason}"
         return [*lines, f"{verdict}, where it was checked" if self.passed and self.unexercised else verdict]
 
     def _coverage_lines(self) -> list[str]:
