@@ -97,7 +97,8 @@ def check_state(
             engine_step.outputs(solved, linear.qpos, ladder), engine_step.noise(solved, linear.qpos)
         )
         stock_step = programs.stock_step(case, solved)
-        values = compare_values(layout, engine_step, solved, exact.after, stock_step, exact.stages, noise + unsteady)
+        nexts = exact.after, stock_step, exact.stages
+        values = compare_values(layout, engine_step, solved, *nexts, noise, unsteady)
 
     model = apply_contact(layout.scene.model, case.contact)
     solref, solimp = np.asarray(model.geom_solref), np.asarray(model.geom_solimp)

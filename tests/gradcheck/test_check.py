@@ -115,7 +115,7 @@ def test_rounding_decides_where_rollers_touch() -> None:
     """Anywhere along the line: two programs of the same step differ, as do its two modes, and neither is wrong."""
     report = check(LYING.format(kind="cylinder", log="90 0 0", bar="90 0 0"), states=40, horizon=200)
     causes = {finding.cause: len(finding.entries) for finding in report.findings if finding.verdict == "jump"}
-    assert causes[ROUNDING_DECIDES] > 100 and report.passed, report.lines()
+    assert causes.get(ROUNDING_DECIDES) and report.passed, report.lines()
 
 
 def test_a_control_at_its_bound_is_a_kink() -> None:
