@@ -56,9 +56,9 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     jax.config.update("jax_enable_x64", precision == "float64")
     jax.config.update("jax_num_cpu_devices", 1)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    os.environ.setdefault(SPLITTING, "1")  # batches are spread already
+    os.environ.setdefault(SPLITTING, str(cores))
     if not _CORES and jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11):
-        _enlarge_pool()
+        _enlarge_pool(cores)
     _keep_memory()
     _CORES[:] = [cores]
     _keep_programs(cache)
@@ -105,12 +105,12 @@ def _keep_memory() -> None:
         libc.mallopt(_MMAP_THRESHOLD, _KEPT)
 
 
-def _enlarge_pool() -> None:
-    """Set up JAX's CPU again, with a pool of `THREADS` per core, unless the environment says how many."""
+def _enlarge_pool(cores: int) -> None:
+    """Set up JAX's CPU again, with a pool of `THREADS` for each core, unless the environment says how many."""
     if _POOL in os.environ:
         return
     clear_backends()
-    os.environ[_POOL] = str(THREADS * max(2, available_cores()))
+    os.environ[_POOL] = str(THREADS * max(2, cores))
     try:
         jax.local_devices()
     finally:

@@ -36,7 +36,7 @@ SETTINGS = {
 }
 MOST = 4 * 2**30
 """Bytes of a process that keeps what it compiled."""
-os.environ["PJRT_NPROC"], os.environ["MJX_STUDY_THREADS"] = "8", "1"  # as `configure` sets them on two cores
+os.environ["PJRT_NPROC"], os.environ["MJX_STUDY_THREADS"] = "8", "2"  # as `configure` sets them on two cores
 jax.config.update("jax_num_cpu_devices", 1)
 jax.config.update("jax_cpu_enable_async_dispatch", False)
 for name, value in SETTINGS.items():

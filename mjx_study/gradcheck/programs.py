@@ -98,6 +98,7 @@ class Programs:
         self._exact = compiled("converged steps", self._steps_after, *made_of)
         self._stock = compiled("derivatives of mjx.step", self._stock_derivatives, *made_of)
         self._stock_step = compiled("mjx.step", self._step_of_mjx, *made_of)
+        self._random = np.random.default_rng(0)
 
     def start(self, case: ContactCase, base: HostState, *, stock: bool) -> None:
         point, inputs, outputs = _point(case, base), len(self.layout.inputs), len(self.layout.outputs)
@@ -105,7 +106,7 @@ class Programs:
             self.compiler.start(self._linear, point, _unit_rows(0, size), _unit_rows(0, outputs))
         self.compiler.start(self._exact, point, jnp.asarray(base.qpos), np.zeros((BATCH, inputs)))
         if has_mujoco_law(case.contact):
-            self.compiler.start(self._stock_step, point)
+            self.compiler.start(self._stock_step, point, self._shake())
         if stock:
             self.compiler.start(self._stock, point, _unit_rows(0, inputs))
 
@@ -131,9 +132,13 @@ class Programs:
         reverse = np.concatenate([own.reverse, tape.reverse[:, parameters]], axis=1)
         return Linear(own.qpos, own.residual, forward, reverse, tape.reverse)
 
-    def stock_step(self, case: ContactCase, base: HostState) -> HostState:
-        """Return the state after `mjx.step`, run to convergence from the warm start."""
-        return _host(self.compiler.run(self._stock_step, _point(case, base)), base)
+    def stock_step(self, case: ContactCase, base: HostState, shake: float = 0.0) -> HostState:
+        """Return the state after `mjx.step`, run to convergence from the warm start, with geoms moved by up to `shake`
+        [m]."""
+        return _host(self.compiler.run(self._stock_step, _point(case, base), self._shake(shake)), base)
+
+    def _shake(self, most: float = 0.0) -> Float[np.ndarray, "geoms 3"]:
+        return most * self._random.uniform(-1, 1, (self.layout.scene.host.ngeom, 3))
 
     def stock(self, case: ContactCase, base: HostState) -> Float[np.ndarray, "outputs inputs"]:
         """Jacobian of `mjx.step` by forward mode."""
@@ -191,9 +196,10 @@ class Programs:
         _, push = jax.linearize(output, jnp.zeros(len(self.layout.inputs)))
         return jax.lax.map(push, push_rows)
 
-    def _step_of_mjx(self, point):
+    def _step_of_mjx(self, point, shake):
         layout, ((contact, scales), state, control) = self.layout, point
         model = constraint.with_generous_budget(layout.model(contact, scales, jnp.zeros(len(layout.scales))))
+        model = model.replace(geom_pos=model.geom_pos + shake)
         return _mjx_step(layout.scene, model, state, control)[0]
 
 

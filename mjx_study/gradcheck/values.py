@@ -104,11 +104,11 @@ def compare_values(
         verdict = "engine_mismatch" if documented else "engine"
     gap, other = (gaps[0], stock) if verdict == "value" else (gaps[1], theirs)
     worst = int(np.argmax(np.nan_to_num(gap, nan=np.inf)))
-    ours_there, other_there = (float(_change(layout.scene.host, state, after)[worst]) for after in (ours, other))
+    ours_there, other_there = (float(change(layout.scene.host, state, after)[worst]) for after in (ours, other))
     return Values(from_stock, from_engine, verdict, cause, worst, (ours_there, other_there))
 
 
-def _change(host: mujoco.MjModel, before: HostState, after: HostState) -> Float[np.ndarray, " outputs"]:
+def change(host: mujoco.MjModel, before: HostState, after: HostState) -> Float[np.ndarray, " outputs"]:
     """Change of position in the tangent space, velocity and activation."""
     tangent = tangent_of(host, before.qpos, after.qpos)
     return np.concatenate([tangent, after.qvel - before.qvel, after.act - before.act])
@@ -139,7 +139,7 @@ def _apart(
         still[first : first + 3] = np.where(turning.max() <= MIN_TURNING, turning, 0.0)
     unseen = (ROUNDING * max(1.0, largest(before.qpos)) + timestep * still, ROUNDING * speed, ROUNDING)
     scales = (timestep * speed, timestep * force, activation)
-    parts = np.split(_change(host, theirs, ours), [host.nv, 2 * host.nv])
+    parts = np.split(change(host, theirs, ours), [host.nv, 2 * host.nv])
     gaps = [np.abs(part) - rounding for part, rounding in zip(parts, unseen, strict=True)]
     sizes = [np.full(len(part), max(scale, 1e-10 * timestep)) for part, scale in zip(parts, scales, strict=True)]
     return np.maximum(np.concatenate(gaps) - noise, 0.0) / np.concatenate(sizes)
