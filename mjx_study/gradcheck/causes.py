@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mjx_study.gradcheck.coordinates import LENGTH, Coordinate, Coordinates, joint_name, joints_above, quaternions
-from mjx_study.gradcheck.differences import UNSEEN
+from mjx_study.gradcheck.differences import SHAKE
 from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.simulation.engine import HostState, host_data
 from mjx_study.simulation.scene import num_constraint_rows
@@ -21,7 +21,7 @@ PARALLEL: Final = 1e-5
 """Angle [rad] or distance [m] below which directions or points coincide; contact points turn within less."""
 SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints are redundant)"
 ROUNDING_DECIDES: Final = (
-    f"rounding decides where bodies touch: the step jumps within changes of {UNSEEN:g} in its state"
+    f"rounding decides where bodies touch: the step jumps within changes of {SHAKE:g} in its state or geoms"
 )
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 _PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SPHERE)

@@ -22,6 +22,8 @@ EPSILON: Final = 1e-15  # a few rounding errors of a float64
 UNSEEN: Final = 1e-13
 """Change of the inputs that no number of a user's depends on, though a few hundred rounding errors of a float64."""
 UNSEEN_MOVES: Final = 64
+SHAKE: Final = 1e-11
+"""Distance by which geoms move where `mjx.step` may jump and symmetry hides it from changes of the inputs [m]."""
 SMOOTH, KINK = 1.5, 0.5  # powers of h between which the second difference indicates a kink, whose power is 1
 
 

@@ -25,6 +25,7 @@ from mjx_study.gradcheck.diagnosis import (
     worst_error,
 )
 from mjx_study.gradcheck.differences import (
+    SHAKE,
     Differences,
     moves,
     solution_noise,
@@ -43,9 +44,8 @@ from mjx_study.table import grouped
 from mjx_study.tasks.contact_grid import ContactPoint
 
 STOCK: Final = "mjx.step"
-SHAKE: Final = 1e-11  # distance by which geoms move where `mjx.step` may jump [m]
-SHAKES: Final = 8  # number of such moves
-MOST_SLOPE: Final = 1e6  # change of the step over that distance beyond which it does; contact's, h k / m, is below
+SHAKES: Final = 8  # number of steps with geoms moved by `SHAKE`
+MOST_SLOPE: Final = 1e6  # change of a step over `SHAKE` beyond which rounding decides; h k / m of a contact is below
 MARGIN: Final = 10.0  # by which the jump between other programs may exceed the largest of `SHAKES`
 _Kind = tuple[str, str, tuple[str, ...], str]
 """Owner of the derivative, verdict, modes and cause, which the entries of a finding have in common."""
