@@ -28,6 +28,10 @@ ROWS = [
 ]
 # Parameters of a rollout in which contact happens, within few steps; those of the task itself otherwise.
 THETA = {"sliding_box": 0.3, "ball_wall": 0.15, "ball_wall:dome": 0.15, "momentum_transfer": 0.3}
+# Where a sphere of 1 kg meets a paddle of 1,000 kg, a force is a slack of 0.007 m/s^2 times 5e7, the derivative of D
+# over d_width, and the slack is a difference of numbers near 74, whose rounding is 1.4e-14. XLA computes it once per
+# entry, in vectors or not, and so rounds it differently: 7.7e-9 of the row's largest derivative.
+MODES = {"tennis": 1e-8}
 
 
 @pytest.mark.parametrize(("name", "cone", "horizon", "stiffness"), ROWS)
@@ -39,7 +43,7 @@ def test_steps_and_gradients_are_right(name: str, cone: str, horizon: int, stiff
     assert [check.contact for check in report.steps] == [check.contact for check in report.costs] == list(FAMILIES)
     assert report.passed, "\n".join(report.lines())
     for step in report.steps:
-        assert step.differences <= SMOOTH and step.modes < 1e-9 and step.residual < 1e-6, step
+        assert step.differences <= SMOOTH and step.modes < MODES.get(name, 1e-9) and step.residual < 1e-6, step
     for cost in report.costs:
         assert cost.gradient_norm > 0 and cost.modes < 1e-9, cost
         assert cost.difference <= SMOOTH or cost.verdict in ("kink", "jump"), cost
