@@ -341,13 +341,13 @@ def test_samples_are_drawn_until_the_verdict_is_had_or_time_is_up(found: Diagnos
     def open_to(path: Circulation, seconds: float, **changes: Any) -> int:
         first = planted(verdict="undecided", paths=(path,), **changes)
         best = planted(estimator="zobg", variance=5.0)
-        return more_samples(Measurement(500, seconds, {}, 0, (best, first)))
+        return more_samples(Measurement(500, seconds, 1.0, {}, 0, (best, first)))
 
     assert open_to(crossed(0.01, 0.02), 1.0) == 4 and open_to(crossed(0.01, 0.02), 10.0) == 0
     assert open_to(crossed(0.01, 0.03), 1.0) == 8 and open_to(crossed(0.01, 0.06), 1.0) == 0  # 32 exceed the most
     assert open_to(crossed(0.01, 0.02, quadrature=0.1), 1.0) == 0
     assert open_to(crossed(0.01, 0.02), 1.0, variance=6.0) == 0  # it cannot be the best
-    unseen = Measurement(500, 1.0, {}, 0, (planted(estimator="zobg", norm=0.1),))
+    unseen = Measurement(500, 1.0, 1.0, {}, 0, (planted(estimator="zobg", norm=0.1),))
     assert more_samples(unseen) == 4 and more_samples(dataclasses.replace(unseen, seconds=8.0)) == 0
 
 
@@ -418,6 +418,8 @@ def test_cautions_of_derivatives_and_stability(found: Diagnosis) -> None:
     early = dataclasses.replace(found, derivatives=dataclasses.replace(found.derivatives, findings=(finding,)))
     assert document_of(early)["derivatives"] == "unconverged"
     assert "do not trust a first-order estimate" in "\n".join(page_lines(early))
+    idle = dataclasses.replace(found, cost=1e7 * found.norm * found.setting.sigma)
+    assert ["hardly depends" in "\n".join(page_lines(each)) for each in (found, idle)] == [False, True]
     unstable = dataclasses.replace(found.touches[0], stiffness=9.0, stable=False)
     page = page_lines(dataclasses.replace(found, touches=(*found.touches, unstable)))
     assert [line.split()[-1] for line in page if line.startswith("  floor and ball")] == ["UNSTABLE", "stable"]

@@ -10,6 +10,7 @@ from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_ST
 from mjx_study.table import number, percent
 
 MIN_SAMPLES: Final = 100  # number of samples below which the page warns
+LEAST_EFFECT: Final = 1e-6  # change of the cost over sigma, relative to the cost, below which the page warns
 SMOOTH_SHARE: Final = 0.01
 """Share of the approach speed lost in the first step below which force counts as setting in without a jump."""
 WIDTH_RATIO: Final = 3.0  # recommended width of the impedance's rise, as a multiple of a step's travel
@@ -32,6 +33,11 @@ def cautions(found: Diagnosis) -> Iterator[str]:
         yield (
             f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}; take a "
             "smaller --timestep or a softer contact"
+        )
+    if 0 < (effect := found.norm * found.setting.sigma) < LEAST_EFFECT * found.cost:
+        yield (
+            f"the cost hardly depends on theta: within sigma it changes by {number(effect, 1)}, and is "
+            f"{number(found.cost, 1)}; take another cost, or controls in units in which they matter"
         )
     if found.samples < MIN_SAMPLES:
         yield f"{found.samples} samples are few: --samples {SAMPLES} takes longer and resolves more"

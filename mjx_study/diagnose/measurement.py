@@ -97,10 +97,12 @@ class Measurement:
         onsets: `mjx_study.results.variables.ONSETS` of the first-order batch; empty under a law other than MuJoCo's.
         unconverged: number of rollouts in which the solver did not converge.
         seconds: time of drawing the samples and checking the means [s].
+        cost: mean magnitude of the cost.
     """
 
     samples: int
     seconds: float
+    cost: float
     onsets: dict[str, float]
     unconverged: int
     estimators: tuple[Measured, ...]
@@ -234,7 +236,8 @@ def measure(
             events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
             onsets = dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True))
         unsolved = max(unconverged(each, precision()) for each in residuals.values())
-        unordered = Measurement(samples, time.perf_counter() - begun, onsets, unsolved, tuple(found))
+        cost = float(jnp.nanmean(jnp.abs(batches["evaluation"].value)))
+        unordered = Measurement(samples, time.perf_counter() - begun, cost, onsets, unsolved, tuple(found))
         order = sorted(found, key=lambda each: each.error(unordered.norm))
         return dataclasses.replace(unordered, estimators=tuple(order))
 
