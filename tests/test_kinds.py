@@ -205,7 +205,7 @@ def test_a_study_is_drawn_reported_and_tabulated(studies: dict[str, Path], copy:
     page = render_report(found)
     assert page.count("data:image/png;base64,") == len(FIGURES[name])
     assert all(f'alt="{figure}: ' in page for figure in figures) and "jaxlib" in page
-    assert "http" not in page.replace("http-equiv", "") and "<script" not in page  # it needs nothing else
+    assert "://" not in page and "<script" not in page  # it needs nothing else; figures may spell "http" by chance
     assert page.count("<td>FoBG</td>") == 2 * ("fobg" in found["estimator"].values)
     first, *others = sorted((copy / "cells").iterdir())
     first.unlink()
