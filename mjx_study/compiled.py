@@ -20,6 +20,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import cache, cached_property
 from pathlib import Path
+from threading import Lock
 from typing import Any, Final
 
 import jax
@@ -68,7 +69,9 @@ class Compiled:
         self._function, self._made_of = function, made_of
         self._name = str(made_of[0]) if made_of else getattr(function, "__name__", "program")
         self._ready: dict[str, Callable[..., Any]] = {}
+        self._traced: dict[str, tuple[Any, Callable[[], Callable[..., Any]]]] = {}
         self._begun: set[str] = set()
+        self._lock = Lock()
 
     @cached_property
     def _whole(self) -> Callable[..., Any]:
@@ -96,7 +99,7 @@ class Compiled:
             A function of arguments of this form, which threads may call in parallel.
         """
         if platform not in (None, jax.default_backend()):
-            return self._traced(arguments)
+            return self._uncached(arguments)
         return self._prepared(*self._form(arguments), arguments)
 
     def within(self, *arguments: Any) -> Callable[..., Any]:
@@ -109,7 +112,12 @@ class Compiled:
         return jax.jit(loaded.__wrapped__)  # XLA's options are those of the other program
 
     def outputs(self, *arguments: Any, platform: str | None = None) -> Any:
-        """Shapes and types of the outputs, without running the function; see `prepare` for the arguments."""
+        """Shapes and types of the outputs, from the function's trace; see `prepare` for the arguments."""
+        if platform in (None, jax.default_backend()):
+            key, types, form = self._form(arguments)
+            self._trace(key, types, form, arguments)
+            if traced := self._traced.get(key):
+                return traced[0]
         ready = self.prepare(*arguments, platform=platform)
         return ready.out_info if isinstance(ready, jax.stages.Compiled) else jax.eval_shape(ready, *arguments)
 
@@ -145,13 +153,14 @@ class Compiled:
         options: dict[str, Any] | None = None,
     ) -> Callable[[], None]:
         """Trace the function, and return a function that compiles it unless that has begun before."""
-        ready = self._prepared(key, types, form, arguments)
+        self._trace(key, types, form, arguments)
         if key in self._begun:
             return lambda: None
         self._begun.add(key)
 
         def compile_it() -> None:
-            lowered = ready.lower(*form.unflatten(types))
+            lowered: Any = self._prepared(key, types, form, arguments)
+            lowered = lowered.lower(*form.unflatten(types))
             try:
                 self._ready[key] = lowered.compile(options)
             except jax.errors.JaxRuntimeError as error:
@@ -172,14 +181,31 @@ class Compiled:
         return self._key(repr((form, types))), types, form
 
     def _prepared(self, key: str, types: list[jax.ShapeDtypeStruct], form: Any, arguments: Any) -> Callable[..., Any]:
-        """The traced function of a form of arguments, compiled if `ahead` has."""
-        if key not in self._ready:
-            path = self._path(key)
-            kept = None if path is None else _read(path, self._name) or self._export(path, types, form)
-            self._ready[key] = kept or self._traced(arguments)
+        """The function of a form of arguments, traced and lowered, and compiled if `ahead` has.
+
+        Lowering waits for the libraries of native code that tracing has begun to build.
+        """
+        self._trace(key, types, form, arguments)
+        with self._lock:
+            if key not in self._ready:
+                self._ready[key] = self._traced[key][1]()
+                del self._traced[key]
         return self._ready[key]
 
-    def _traced(self, arguments: Any) -> Callable[..., Any]:
+    def _trace(self, key: str, types: list[jax.ShapeDtypeStruct], form: Any, arguments: Any) -> None:
+        """Trace the function in this thread, or load its cached trace, unless that was done before."""
+        if key in self._traced or key in self._ready:
+            return
+        path = self._path(key)
+        if kept := None if path is None else _read(path, self._name):
+            self._ready[key] = kept
+        elif path is None or not (traced := self._exportable(path, types, form)):
+            self._ready[key] = self._uncached(arguments)
+        else:
+            outputs, export = traced
+            self._traced[key] = outputs, lambda: export() or self._uncached(arguments)
+
+    def _uncached(self, arguments: Any) -> Callable[..., Any]:
         """The function as a program of its own, traced."""
         jax.eval_shape(self._whole, *arguments)
         return self._whole
@@ -207,29 +233,37 @@ class Compiled:
             return None
         return folder / f"{hashlib.sha256(repr((self._contents.digest, key)).encode()).hexdigest()[:32]}.trace"
 
-    def _export(self, path: Path, types: Sequence[jax.ShapeDtypeStruct], form: Any) -> Callable[..., Any] | None:
-        """Trace the function and cache the trace; None if JAX cannot export it."""
+    def _exportable(
+        self, path: Path, types: Sequence[jax.ShapeDtypeStruct], form: Any
+    ) -> tuple[Any, Callable[[], Callable[..., Any] | None]] | None:
+        """Trace the function. None if that fails, else its outputs' types, and what lowers the trace and caches it, in
+        any thread: that gives None if JAX cannot export it."""
         assert self._contents is not None
-        outputs: list[Any] = []
+        structures: list[Any] = []
 
         def of_leaves(*leaves: Any) -> list[Any]:
             found, structure = jax.tree.flatten(self._function(*form.unflatten(leaves)))
-            outputs[:] = [structure]
+            structures[:] = [structure]
             return found
 
-        try:
-            jitted = jax.jit(_named(of_leaves, self._name))
-            with observing(path.stem) if self._contents.own else nullcontext():
-                jitted.trace(*types)
-            inputs = sources_and_inputs() if self._contents.own else {}
-            program = jax.export.export(jitted, disabled_checks=_CallingAny())(*types)
+        def export() -> Callable[..., Any] | None:
+            try:
+                program = jax.export.export(jitted, disabled_checks=_CallingAny())(*types)
+            except ValueError:  # an operation that cannot be exported
+                return None
             called = libraries_in(program.mlir_module_serialized)
             trace = dataclasses.replace(program, disabled_safety_checks=_calling(called)).serialize()
-            kept = _header(outputs[0], inputs) + bytes(trace)
-        except ValueError:  # an operation that cannot be exported, or outputs that cannot be pickled
+            write_cached(path, header + bytes(trace))
+            return _load(header + bytes(trace), self._name)
+
+        jitted = jax.jit(_named(of_leaves, self._name))
+        try:
+            with observing(path.stem) if self._contents.own else nullcontext():
+                outputs = jitted.trace(*types).out_info
+            header = _header(structures[0], sources_and_inputs() if self._contents.own else {})
+        except ValueError:  # outputs that cannot be pickled
             return None
-        write_cached(path, kept)
-        return _load(kept, self._name)
+        return structures[0].unflatten(outputs), export
 
 
 class Builds:

@@ -8,17 +8,20 @@ from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
 
 import estimators
 from estimators import user_inputs
 from mjx_study import compiled, identity
-from mjx_study.compiled import Compiled
+from mjx_study.compiled import Builds, Compiled
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import gradient_numbers
 from mjx_study.graph import build
@@ -58,6 +61,20 @@ def test_a_trace_is_found_again_and_gives_the_same_bits(folder: Path, monkeypatc
         np.testing.assert_array_equal(evaluated(pusher()), first)
     monkeypatch.setattr(compiled, "traces_folder", lambda: None)
     np.testing.assert_array_equal(evaluated(pusher()), first)
+
+
+def test_what_lowering_waits_for_does_not_hold_up_the_next_trace() -> None:
+    built, waiting = Event(), Primitive("waiting")
+    waiting.def_abstract_eval(lambda x: x)
+    mlir.register_lowering(waiting, lambda _, x: [x] if built.wait(60) else [])
+    program, builds = Compiled(lambda x: waiting.bind(x) + 1.0, "waiting"), Builds(threads=1)
+    kind = jax.ShapeDtypeStruct((3,), float)
+    builds.start(program, kind)
+    assert program.outputs(kind).shape == (3,)
+    built.set()
+    builds.wait()
+    np.testing.assert_array_equal(program(np.zeros(3)), np.ones(3))
+    assert program.num_compilations == 1
 
 
 def test_a_rollout_alone_is_found_again_though_its_native_code_is_not_for_batches(folder: Path) -> None:

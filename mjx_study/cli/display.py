@@ -1,7 +1,7 @@
 """Progress of a command on standard error: what is traced, compiled, built and computed, and for how long.
 
-JAX announces when it begins to trace or compile a program, so no computation needs to report that. A thread looks every
-second whether it is time for a sign of life.
+JAX announces when it begins to trace, lower or compile a program, so no computation needs to report that. A thread
+looks every second whether it is time for a sign of life.
 """
 
 import re
@@ -16,7 +16,7 @@ from mjx_study.table import grouped
 
 EVENTS: Final = {
     "/jax/core/compile/jaxpr_trace_duration": "tracing",
-    "/jax/core/compile/jaxpr_to_mlir_module_duration": "tracing",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering",
     "/jax/core/compile/backend_compile_duration": "compiling",
 }
 """JAX's events, by what they say."""
