@@ -74,6 +74,6 @@ def test_a_network_is_optimised_and_replayed(capsys: pytest.CaptureFixture[str],
     assert facts["theta"] == json.loads(policy.read_text())["theta"] and len(facts["theta"]) == 25
     assert facts["cost"] < document["start_cost"][0]
     assert cli.main(["optimise", "pusher", "--network", "4", "--reference"]) == 2
-    assert "a network needs MJX" in capsys.readouterr().err
+    assert "--network needs MJX" in capsys.readouterr().err
     assert cli.main(["optimise", "pusher", "--network", "wide"]) == 2
     assert "--network must be a whole number, got 'wide'" in capsys.readouterr().err
