@@ -29,8 +29,7 @@ import jax.export
 from estimators.user_inputs import inputs_now, observing, sources_and_inputs
 from mjx_study.caches import read_cached, write_cached
 from mjx_study.graph.build import known_libraries, libraries_in, library_ready
-from mjx_study.graph.native import count_left, native_identity, switched_on
-from mjx_study.graph.scans import AS_THEY_ARE
+from mjx_study.graph.native import native_identity
 from mjx_study.identity import TraceContents, trace_contents
 from mjx_study.runtime import available_cores, precision, traces_folder
 from mjx_study.simulation.scene import Scene
@@ -47,9 +46,6 @@ OPTIONS: Final[dict[str, tuple[str, str]]] = {
 }
 """XLA's options for programs, by backend. On CPUs operations run one after the other where they can: threads call
 several programs at once already, and LAPACK calls would wait for each other (`runtime.configure`)."""
-
-LOST_CALL: Final = "No registered implementation for untyped custom call"
-"""XLA's message for a call of native code whose type it has lost, as it does in some large programs."""
 
 
 class Compiled:
@@ -159,16 +155,12 @@ class Compiled:
         self._begun.add(key)
 
         def compile_it() -> None:
-            lowered: Any = self._prepared(key, types, form, arguments)
-            lowered = lowered.lower(*form.unflatten(types))
+            ready: Any = self._prepared(key, types, form, arguments)
+            lowered = ready.lower(*form.unflatten(types))
             try:
                 self._ready[key] = lowered.compile(options)
-            except jax.errors.JaxRuntimeError as error:
-                if LOST_CALL in str(error):
-                    count_left("loop in a program in which XLA loses its type")
-                    with switched_on(AS_THEY_ARE):
-                        lowered = jax.jit(_named(self._function, self._name)).lower(*form.unflatten(types))
-                elif options is None:
+            except jax.errors.JaxRuntimeError:
+                if options is None:
                     raise
                 self._ready[key] = lowered.compile()
 

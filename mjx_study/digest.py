@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from mjx_study.simulation.scene import Scene
-from mjx_study.sources import Sources, by_version, is_users, source_file
+from mjx_study.sources import Sources, by_version, functions_by_name, is_users, source_file
 
 IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|light|cam|text)_.*|.*_matid")
 """Fields of MjModel that do not affect results."""
@@ -233,7 +233,10 @@ class Digest:
             return
         self.sources.add(home)
         code, path = function.__code__, source_file(home)
-        if path is None or code.co_filename != str(path):  # from an interactive session, or made at run time
+        if code.co_qualname != function.__qualname__:  # which decorators copy
+            self._note("code of", code.co_qualname)
+        made = path is None or code.co_filename != str(path)  # in an interactive session, or at run time
+        if made or functions_by_name(path.read_bytes())[code.co_qualname] != 1:
             self._code(code)
         names = _names(code)
         for name in sorted(names & function.__globals__.keys()):

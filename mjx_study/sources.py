@@ -8,6 +8,8 @@ import functools
 import hashlib
 import sys
 import types
+from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -84,6 +86,20 @@ def source_file(module: str) -> Path | None:
     """Path of a module's source; None in an interactive session or for compiled modules."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return Path(file) if file is not None and Path(file).is_file() else None
+
+
+@functools.lru_cache(100)
+def functions_by_name(source: bytes) -> Counter[str]:
+    """Number of functions of each qualified name in a source file, as two lambdas of one scope; none if it cannot be
+    read."""
+    found, left = Counter[str](), list[types.CodeType]()
+    with suppress(SyntaxError, ValueError):
+        left.append(compile(source, "<source>", "exec", dont_inherit=True))
+    while left:
+        inner = [each for each in left.pop().co_consts if isinstance(each, types.CodeType)]
+        found.update(each.co_qualname for each in inner)
+        left += inner
+    return found
 
 
 def _is_neighbour(other: str, module: str, root: Path) -> bool:

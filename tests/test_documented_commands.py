@@ -1,5 +1,6 @@
 """Every command that the README, the pages and the help show does what it says, at a small size."""
 
+import json
 import re
 import shlex
 import shutil
@@ -10,7 +11,7 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.cli.gradcheck import UNEXERCISED
-from mjx_study.tasks import TASKS
+from mjx_study.tasks import TASKS, make_task
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -105,6 +106,9 @@ def test_every_command_runs(
         ran.add(tuple(command))
         if folder is not None and command[0] in ("compare", "landscape", "optimise", "sweep"):
             shutil.rmtree(here / folder, ignore_errors=True)  # another study may be there, and would be kept
+        if "--theta" in command and not (theta := Path(command[command.index("--theta") + 1])).exists():
+            theta.parent.mkdir(exist_ok=True)  # as a descent writes it
+            theta.write_text(json.dumps(make_task(command[1], horizon=4).theta.tolist()))
         code = cli.main(small(command))
         printed = capsys.readouterr()
         if "mp4" in command and shutil.which("ffmpeg") is None:

@@ -30,7 +30,7 @@ from tests.processes import run_script
 
 TASK = """
 import data, importlib, os
-from functools import lru_cache, partial
+from functools import lru_cache, partial, wraps
 from pathlib import Path
 import jax, jax.numpy as jnp, numpy as np
 from mjx_study.tasks.pusher import pusher
@@ -90,6 +90,22 @@ CASES: dict[str, tuple[str, str, str]] = {
     "a default argument": ("def cost(state, by=[data.SCALE]): return by[0] * state.qpos[0]", "cost", IN_TASK),
     "a function made at run time": (
         "exec(f'def cost(state): return {data.SCALE} * state.qpos[0]')", "cost", "task hopping:hop",
+    ),
+    "which of two lambdas": (
+        "COSTS = [lambda state: state.qpos[0], lambda state: state.qpos[1]]", "COSTS[int(data.SCALE) - 1]", IN_TASK,
+    ),
+    "which of two functions of one name": (
+        "if data.SCALE > 1:\n    def cost(state): return state.qpos[0]\n"
+        "else:\n    def cost(state): return state.qpos[1]", "cost", IN_TASK,
+    ),
+    "which of two classes of one name": (
+        "if data.SCALE > 1:\n    class It:\n        def __call__(self, state): return state.qpos[0]\n"
+        "else:\n    class It:\n        def __call__(self, state): return state.qpos[1]", "It()", IN_TASK,
+    ),
+    "which of two wrappers": (
+        "def wrapped(cost):\n    @wraps(cost)\n    def near(state): return cost(state)\n"
+        "    @wraps(cost)\n    def far(state): return 2 * cost(state)\n    return far if data.SCALE > 1 else near\n"
+        "def cost(state): return state.qpos[0]", "wrapped(cost)", IN_TASK,
     ),
     "a lazy import": (
         "def cost(state):\n    import lazy\n    return lazy.BY * state.qpos[0]", "cost", "source of lazy.py",

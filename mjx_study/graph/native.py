@@ -23,10 +23,12 @@ from mjx_study.graph.numpy_code import python_source
 
 SWITCH: Final = "MJX_STUDY_NATIVE"
 """Environment variable: 0 does without native code, which NumPy stands in for; xla without either."""
+_TYPED: Final = 4
+"""Version of the interface in calls of native code: API_VERSION_TYPED_FFI of StableHLO."""
 _LEFT: Final[Counter[str]] = Counter()
 """Numbers of functions left to XLA, by reason."""
 POSTPONED: Final[ContextVar[bool]] = ContextVar("postponed", default=False)
-"""Whether functions are called without building their libraries."""
+"""Whether functions are `postponed`."""
 
 
 def native_identity() -> str | None:
@@ -133,13 +135,13 @@ class NativeFunction:
 
 
 @contextmanager
-def switched_on(switch: ContextVar[bool]) -> Generator[None]:
-    """Set a switch, such as `POSTPONED`, in this context."""
-    token = switch.set(True)
+def postponed() -> Generator[None]:
+    """Call functions in this context without building their libraries."""
+    token = POSTPONED.set(True)
     try:
         yield
     finally:
-        switch.reset(token)
+        POSTPONED.reset(token)
 
 
 def _plain(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) -> list[jax.Array]:
@@ -191,7 +193,12 @@ def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction
         return _lower_plain(context, *operands, function=function, batch=batch)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]
-    return jax.ffi.ffi_lowering(function.name, operand_layouts=ins, result_layouts=outs)(context, *operands)
+    lowering = jax.ffi.ffi_lowering(function.name, operand_layouts=ins, result_layouts=outs)
+    results: Any = lowering(context, *operands)
+    attributes = results[0].owner.attributes  # JAX says that the call is typed beside the operation, where XLA loses it
+    del attributes["mhlo.backend_config"]
+    attributes["api_version"], attributes["backend_config"] = mlir.i32_attr(_TYPED), mlir.ir.DictAttr.get()
+    return results
 
 
 def _layout(rank: int, batched: int) -> tuple[int, ...]:

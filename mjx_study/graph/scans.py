@@ -6,7 +6,6 @@ becomes one function whose body is a graph, native code that it calls included.
 """
 
 from collections.abc import Callable, Sequence
-from contextvars import ContextVar
 from functools import partial
 from typing import Any, Final
 
@@ -19,7 +18,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from mjx_study.graph.c import NotWrittenError
 from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, programs_in, run, scan_inputs
-from mjx_study.graph.native import POSTPONED, NativeFunction, count_left, native_identity, switched_on, written
+from mjx_study.graph.native import NativeFunction, count_left, native_identity, postponed, written
 from mjx_study.graph.nodes import ScalarGraph, TooLargeError, constants
 from mjx_study.graph.scalars import most_scalars
 
@@ -32,18 +31,15 @@ MOST_CALLED: Final = 100_000
 MOST_CARRIED: Final = 500
 """Maximum number of scalars from one pass to the next."""
 
-AS_THEY_ARE: Final = ContextVar("as they are", default=False)
-"""Switch: functions `with_native_scans` are traced as if they were without."""
-
 
 def with_native_scans(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function of pytrees of arrays with its scans as native code where possible; to be batched, not
     differentiated."""
 
     def program(*arguments: Any) -> Any:
-        if native_identity() is None or AS_THEY_ARE.get():
+        if native_identity() is None:
             return function(*arguments)
-        with switched_on(POSTPONED):
+        with postponed():
             closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
         leaves, structure = jax.tree.flatten(shape)
         closed = _without_rules(closed)

@@ -24,8 +24,8 @@ MOST_TEXT: Final = 3000
 """Maximum length of what a refusal prints."""
 OUTPUTS: Final = {"out", "results"}
 """Folders that commands are asked to write to, or write to by default."""
-BESIDE: Final = re.compile(r"MuJoCo: | *\d+\.\d s  \[")
-"""Beginnings of lines that may come beside a refusal: warnings and stages."""
+BESIDE: Final = re.compile(r"MuJoCo: | *\d+\.\d s  ")
+"""Beginnings of lines that may come beside a refusal: warnings, stages and signs of life."""
 
 
 class Planned(BaseException):
