@@ -56,6 +56,9 @@ DEFAULT_SOLREF: Final = (0.02, 1.0)
 DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
 STIFF_SOLIMP: Final = (0.99, 0.9999, 0.001, 0.5, 2.0)
 
+UNDAMPED: Final = re.compile("without damping|critically damped")
+"""What descriptions of contact families say about damping that is not given."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Family:
@@ -82,6 +85,13 @@ class Family:
     def swept(self) -> bool:
         """Whether the family takes a stiffness."""
         return self.solref is None and self.solimp is not None
+
+    def described(self, given: float | None, defaults: Iterable[float]) -> str:
+        """The description with the damping that is in force [N s/m]: the one given, or else of the tasks."""
+        chosen = {given} if given is not None else set(defaults) if not self.dampratio else set[float]()
+        if not self.swept or not chosen - {0.0}:
+            return self.description if given is None else UNDAMPED.sub("without damping", self.description)
+        return UNDAMPED.sub(f"damped by {' or '.join(f'{each:g}' for each in sorted(chosen))} N s/m", self.description)
 
 
 def _constant(impedance: float) -> tuple[float, float, float, float, float]:

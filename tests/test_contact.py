@@ -330,3 +330,22 @@ def test_rows_exist_where_contact_begins() -> None:
     run = jax.jit(force)
     near, far = (contact_model((-1000.0, 0.0), margin=m, scene=scene) for m in (0.0011, 0.0009))
     assert float(run(near)) > 0 == float(run(far))
+
+
+@pytest.mark.parametrize(
+    ("family", "given", "of_tasks", "told"),
+    [
+        ("penalty", None, [0.0], "spring K without damping, impedance"),
+        ("penalty", None, [20.0], "spring K damped by 20 N s/m, impedance"),
+        ("penalty", None, [1.0, 20.0], "spring K damped by 1 or 20 N s/m, impedance"),
+        ("penalty", 0.0, [20.0], "spring K without damping, impedance"),
+        ("mujoco", None, [20.0], "K critically damped"),
+        ("mujoco", 5.0, [20.0], "K damped by 5 N s/m"),
+        ("mujoco", 0.0, [20.0], "K without damping"),
+        ("mujoco_default", None, [20.0], "MuJoCo's defaults: solref"),
+    ],
+)
+def test_descriptions_tell_the_damping_in_force(
+    family: str, given: float | None, of_tasks: list[float], told: str
+) -> None:
+    assert told in FAMILIES[family].described(given, of_tasks)

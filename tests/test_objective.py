@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from estimators import Evaluation, first_order, zeroth_order
-from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
+from mjx_study.objective import MAX_CHUNK, MjxObjective, Simulator, chunk_for
 from mjx_study.runtime import local_devices
 from mjx_study.simulation import dynamics
 from mjx_study.simulation.contact import ContactModel, family_model
@@ -295,11 +295,21 @@ def test_batches_refuse(simulator, name: str, sigma: float | None, params: int, 
         getattr(objective, name)(jnp.zeros(params), sample_keys(2)[:samples])
 
 
+def longer() -> MjxObjective:
+    """Of a task with more steps than its policy has."""
+    return Simulator(pusher_task().replace(horizon=HORIZON + 1), chunk_size=1).objective(None)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: Simulator(pusher_task(), chunk_size=0), "chunk_size must be at least 1 sample, got 0"),
         (lambda: make_task("pusher", horizon=0), "horizon must be at least 1 step, got 0"),
+        (
+            lambda: longer().evaluate(pusher_task().theta, sample_keys(1)),
+            f"the policy's feedforward has shape .{HORIZON}, 1.; {HORIZON + 1} steps and 1 controls need",
+        ),
+        (lambda: initial_state(pusher_task().scene, jnp.zeros(3)), "qpos has shape .3,.; the scene needs .2,."),
         (lambda: pusher_task().replace(sigma=0.0), SIGMA_RANGE),
         (lambda: pusher_task().replace(theta=jnp.zeros(HORIZON - 1)), THETA_SHAPE),
     ],

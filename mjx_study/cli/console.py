@@ -124,8 +124,9 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
             f"seed {config['seed']}, {document['environment']['precision']}{_chosen(config)}"
         )
     width = shutil.get_terminal_size((140, 24)).columns
+    damping = config.get("damping"), [entry.get("damping", 0.0) for entry in document["resolved"]]
     for family in dict.fromkeys(row.contact for row in rows):
-        lines += ["", f"{family}: {FAMILIES[family].description}" if family in FAMILIES else family]
+        lines += ["", f"{family}: {FAMILIES[family].described(*damping)}" if family in FAMILIES else family]
         lines += itertools.chain(*_blocks([row for row in rows if row.contact == family], shown, width))
     lines.append("")
     uncertainty = [row.reference_uncertainty for row in rows if math.isfinite(row.reference_uncertainty)]

@@ -34,8 +34,17 @@ def rollout_cost(
     Returns:
         The cost; and the states `(horizon + 1, ...)` including the initial one, the controls, the largest relative
         solver residual, and the onset counts (None without the onset term).
+
+    Raises:
+        ValueError: the policy is for another number of steps or controls, or the onset term does not go with the
+            contact.
     """
-    feedforward = task.policy.feedforward(theta, noise)
+    feedforward, needed = task.policy.feedforward(theta, noise), (task.horizon, task.scene.host.nu)
+    if feedforward.shape != needed:
+        raise ValueError(
+            f"{task.name}: the policy's feedforward has shape {feedforward.shape}; {needed[0]} steps and {needed[1]} "
+            f"controls need {needed}"
+        )
 
     def control_law(feedforward, state):
         feedback = task.policy.feedback(theta, state)

@@ -81,8 +81,14 @@ class State:
 
 
 def initial_state(scene: Scene, qpos: Qpos | None = None, qvel: Qvel | None = None) -> State:
-    """Return a state at rest in the MJCF's reference pose, or at `qpos` [m or rad] and `qvel` [m/s or rad/s]."""
+    """Return a state at rest in the MJCF's reference pose, or at `qpos` [m or rad] and `qvel` [m/s or rad/s].
+
+    ValueError if their shapes are not the scene's.
+    """
     like = scene.template
+    for name, given in (("qpos", qpos), ("qvel", qvel)):
+        if given is not None and jnp.shape(given) != (needed := getattr(like, name).shape):
+            raise ValueError(f"{name} has shape {jnp.shape(given)}; the scene needs {needed}")
     return State(
         qpos=like.qpos if qpos is None else jnp.asarray(qpos, like.qpos.dtype),
         qvel=like.qvel if qvel is None else jnp.asarray(qvel, like.qvel.dtype),

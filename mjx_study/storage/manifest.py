@@ -41,6 +41,7 @@ class _Config(_Part):
     iterations: Count | None
     points: Count | None = None
     confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
+    damping: Finite | None = None
     onset: Literal[ONSETS] = "none"  # type: ignore[valid-type]
 
 
@@ -76,6 +77,7 @@ class _Resolved(_Part):
     estimators: dict[str, dict[str, Any]]
     parameters: Count = 1
     unit: str = ""
+    damping: Finite = 0.0
 
 
 class _Environment(_Part):
@@ -207,6 +209,7 @@ def _resolved(plan: StudyPlan, places: list[dict[str, int]], tasks: int) -> list
             entry["estimators"] = {name: dataclasses.asdict(estimator) for name, estimator in chosen}
             entry["recipe"] = {} if group.recipe is None else dataclasses.asdict(group.recipe)
             entry |= {"parameters": group.task.policy.num_params, "unit": getattr(group.task.policy, "unit", "")}
+            entry["damping"] = group.task.defaults.damping or 0.0
     return found
 
 
