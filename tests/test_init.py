@@ -166,15 +166,15 @@ def test_what_a_task_is_about() -> None:
     assert proposed(LIMITED).limits == ("swing",)
 
 
-def test_a_straight_arms_goal_is_within_reach() -> None:
-    """Its tip cannot go further out than it is."""
+def test_a_straight_arms_goal_is_where_noise_moves_it() -> None:
+    """Along the arm, the tip moves in second order only: the gradient of a goal there is zero."""
     joints = [f'<joint name="{name}" axis="{axis}" damping=".5"/>' for name, axis in zip("ype", AXES, strict=True)]
     link = '<geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" contype="0" conaffinity="0"/>'
     world = f'<body>{joints[0]}{joints[1]}{link}<body pos=".3 0 0">{joints[2]}{link}</body></body>'
     servos = "".join(f'<position joint="{name}" kp="40" kv="2" ctrlrange="-1 2"/>' for name in "ype")
     text = f"<mujoco><worldbody>{world}</worldbody><actuator>{servos}</actuator></mujoco>"
     aim = proposed(text).aim
-    assert aim.axis == 0 and aim.side == -1 and aim.goal[0] < aim.end[0]
+    assert aim.axis != 0 and aim.goal[0] == pytest.approx(aim.end[0], rel=1e-2)
 
 
 def test_contacts_are_those_of_a_fall() -> None:

@@ -21,7 +21,8 @@ HINGE: Final = int(mujoco.mjtJoint.mjJNT_HINGE)
 BEYOND: Final = 0.25  # share of that distance over which held controls must move a body for it to have a goal
 REACHED: Final = 0.25
 """Share of the ends under held controls from which on a side counts as within reach; else the goal is on the other."""
-FORWARD: Final = 0.3  # share of the greatest spread along an axis from which on the x axis is preferred
+FORWARD: Final = 0.3
+"""Share of the greatest spread along an axis from which on the x axis is preferred, and others may be chosen."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +70,10 @@ def choose_aim(drive: Drive, quiet: Trial, noisy: Sequence[Trial], held: Sequenc
         hardly = np.ptp(far, axis=0).max() < BEYOND * LEAST * drive.host.stat.extent  # as of a wheel on its axle
         if hardly and (aim := _coordinate(quiet, noisy, held, steps, _own_hinges(drive.host, body), LEAST)):
             return aim
-        if not hardly and np.std(ends, axis=0).max() > MOVED:
-            axis = 0 if spread[0] >= FORWARD * spread.max() else int(np.argmax(spread))
+        near = np.std(ends, axis=0)
+        if not hardly and near.max() > MOVED:
+            along = spread * (near >= FORWARD * near.max())  # a stretched arm moves sideways first
+            axis = 0 if along[0] >= FORWARD * along.max() else int(np.argmax(along))
             end = tuple((np.round(quiet.centres[steps, body], 9) + 0.0).tolist())  # without what rounding leaves of 0
             distance = rounded(max(spread[axis], LEAST * drive.host.stat.extent), 1)
             return Aim(body, role, axis, end, distance, _side(far[:, axis], end[axis]))
@@ -98,7 +101,7 @@ def _own_hinges(host: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _side(ends: np.ndarray, end: float) -> int:
-    """The side on which a goal is within reach: forward, unless hardly any rollout ends there, as of a straight arm."""
+    """The side on which a goal is within reach: forward, unless hardly any rollout ends there."""
     return 1 if np.mean(ends > end) >= REACHED else -1
 
 

@@ -17,9 +17,10 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import unknown
 from mjx_study.graph.derivative_rule import instantiated, with_rule
+from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.dynamics import Qvel, State, fwd_position, with_solver
+from mjx_study.simulation.dynamics import Qvel, State, entry_by_entry, fwd_position, with_solver
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.native_step import solved_natively
 from mjx_study.simulation.observed import differentiated_once, tangent_of
@@ -29,6 +30,8 @@ from mjx_study.simulation.saltation import onset_term
 from mjx_study.simulation.touch import Events, crossings, onset_begins
 
 Replacements = dict[Place, Callable[..., mjx.Data]]
+Whole = Callable[[list[Any]], mjx.Model]
+"""Makes a model from its traced leaves; the others stay constants, so that steps are native code."""
 ONSETS: Final = ("none", "linear")
 """Treatments of the onset of contact in the derivatives of a step."""
 
@@ -81,8 +84,10 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
         if onset == "none":
             following = _uncorrected_step(model, data)
         else:
-            preceding = _preceding_contact(*jax.lax.stop_gradient((model, data)))
-            following = jax.checkpoint(_corrected_step, policy=constraint.SAVE_SOLUTION)(model, data, preceding)
+            traced, whole = traced_part(model)
+            preceding = _preceding_contact(whole(jax.lax.stop_gradient(traced)), jax.lax.stop_gradient(data))
+            corrected = jax.checkpoint(partial(_corrected_step, whole), policy=constraint.SAVE_SOLUTION)
+            following = corrected(traced, data, preceding)
     return jax.tree.map(lambda new, old: new.astype(jax.typeof(old).dtype), following, data)
 
 
@@ -167,56 +172,61 @@ def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Preceding:
     step, which tells whether contact had just begun, is approximate where damping is integrated implicitly.
     """
     before = data.qvel - model.opt.timestep * data.qacc
-    course = guards.course(model, data, before, data.qvel, data.qacc)
+    course = entry_by_entry(guards.course, model, data, before, data.qvel, data.qacc)
     existed = (course.distance < 0) & (data.time > 0)
     return Preceding(course, existed, existed & onset_begins(course.distance, model.opt.timestep * course.speed))
 
 
-def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Preceding) -> mjx.Data:
+def _corrected_step(whole: Whole, traced: list[Any], data: mjx.Data, preceding: Preceding) -> mjx.Data:
     """`mjx.step` with the same values, but derivatives that include the onset term.
 
     Delta is that from the velocity of step k, since the state does not contain the one before: an error of order h in
     the term. No contact begins or ends at time 0, which no step precedes.
     """
-    timestep, fixed = model.opt.timestep, jax.lax.stop_gradient(data)
+    model, fixed = whole(traced), jax.lax.stop_gradient(data)
+    timestep = model.opt.timestep
     moved = difference_position(model, fixed.qpos, data.qpos)
     moved_before = moved - tangent_of(timestep * data.qvel)
-    earlier, later = _onset_change(model, fixed, preceding, moved, moved_before)
+    earlier, later = _onset_change(whole, traced, fixed, preceding, moved, moved_before)
     shifted = integrate_position(model, fixed.qpos, earlier, timestep)
-    after = mjx.step(model, data.replace(qpos=data.qpos + tangent_of(shifted), qvel=data.qvel + tangent_of(earlier)))
+    moving = data.replace(qpos=data.qpos + tangent_of(shifted), qvel=data.qvel + tangent_of(earlier))
+    after = _uncorrected_step(model, moving)
     spread = integrate_position(model, jax.lax.stop_gradient(after.qpos), later, timestep)
     return after.replace(qpos=after.qpos + tangent_of(spread), qvel=after.qvel + tangent_of(later))
 
 
-def _no_change(
-    model: mjx.Model, data: mjx.Data, preceding: Preceding, moved: Qvel, moved_before: Qvel
-) -> tuple[Qvel, Qvel]:
-    return jnp.zeros_like(moved), jnp.zeros_like(moved)
+def _onset_change(whole: Whole, *arguments: Any) -> tuple[Qvel, Qvel]:
+    """Zero velocities, before and after the step, that change with the step at which contact begins or ends.
+
+    Args:
+        whole: makes the model from its traced leaves.
+        arguments: these, the state, what preceded it, and the change of position, also before the step.
+    """
+
+    def zeros(traced: list[Any], data: mjx.Data, preceding: Preceding, moved: Qvel, before: Qvel) -> tuple[Qvel, Qvel]:
+        return jnp.zeros_like(moved), jnp.zeros_like(moved)
+
+    def rule(primals: Any, changes: Any) -> tuple[tuple[Qvel, Qvel], tuple[Qvel, Qvel]]:
+        traced, data, preceding = jax.lax.stop_gradient(primals[:3])
+        of_model = {place: each for place, each in enumerate(changes[0]) if each is not None}
+        spread, shift = _step_terms(whole(traced), data, preceding, {place: traced[place] for place in of_model})
+        change, change_before = (
+            jnp.concatenate([each, ravel_pytree(of_model)[0]]) for each in instantiated(primals[3:], changes[3:])
+        )
+        return _onset_change(whole, *differentiated_once(primals)), (shift @ change_before, spread @ change)
+
+    return with_rule(zeros, rule)(*arguments)
 
 
-def _onset_rule(primals: Any, changes: Any) -> tuple[tuple[Qvel, Qvel], tuple[Qvel, Qvel]]:
-    leaves, structure = jax.tree.flatten(primals[0])
-    of_model = dict(enumerate(structure.flatten_up_to(changes[0])))
-    of_model = {place: each for place, each in of_model.items() if each is not None}
-    moving = {place: jax.lax.stop_gradient(leaves[place]) for place in of_model}
-    model, data, preceding = jax.lax.stop_gradient(primals[:3])
-    spread, shift = _step_terms(model, data, preceding, moving)
-    change, change_before = (
-        jnp.concatenate([each, ravel_pytree(of_model)[0]]) for each in instantiated(primals[3:], changes[3:])
-    )
-    return _onset_change(*differentiated_once(primals)), (shift @ change_before, spread @ change)
-
-
-_onset_change = with_rule(_no_change, _onset_rule)
-"""Zero velocities, before and after the step, that change with the step at which contact begins or ends."""
+def _course_here(model: mjx.Model, data: mjx.Data) -> guards.Course:
+    return guards.course(model, fwd_position(model, data), data.qvel, data.qvel, data.qacc)
 
 
 def _step_terms(
     model: mjx.Model, data: mjx.Data, preceding: Preceding, moving: Moving
 ) -> tuple[Float[Array, "nv changes"], Float[Array, "nv changes"]]:
     """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins or ends; see `onset_term`."""
-    positioned = fwd_position(model, data)
-    here = guards.course(model, positioned, data.qvel, data.qvel, data.qacc)
+    here = entry_by_entry(_course_here, model, data)
     empty = jnp.zeros((model.nv, model.nv + sum(leaf.size for leaf in moving.values())), data.qvel.dtype)
     if not here.distance.size:
         return empty, empty
