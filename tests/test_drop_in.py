@@ -1,5 +1,6 @@
 """The drop-in step: MJX's in every field, with derivatives that MJX's lacks, by itself and under the context."""
 
+import inspect
 import itertools
 import re
 from functools import partial
@@ -266,6 +267,8 @@ def test_what_has_no_derivative_is_refused() -> None:
     host = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
     with pytest.raises(ValueError, match="only MJX's implementation in JAX has derivatives, this model is for cpp"):
         step(mjx.put_model(host, impl="cpp"), mjx.make_data(host))
+    with pytest.raises(TypeError, match="step takes an mjx.Model and mjx.Data, .* not MjModel and MjData"):
+        inspect.unwrap(step)(host, mujoco.MjData(host))  # without run-time checks of types
     host.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     with pytest.raises(ValueError, match="the onset term is that of steps by Euler or implicitfast"):
         step(mjx.put_model(host), mjx.make_data(host), onset="linear")
@@ -326,6 +329,9 @@ def test_the_onset_term_of_a_step_is_that_of_a_rollout(law: Law, speed: float, g
     np.testing.assert_allclose(value, stock, rtol=1e-13)
     np.testing.assert_allclose(corrected, expected, rtol=0, atol=0.01 * np.abs(expected - plain).max())
     assert np.abs(expected - plain).min() > 0.1
+    if native_identity() is not None:  # the step, its derivative, what its guards did, and the term's two parts
+        slope = jax.make_jaxpr(jax.vmap(jax.grad(lambda gap: by_steps(gap, "linear")[0])))(points)
+        assert str(slope).count("native[") >= 6
 
 
 @pytest.mark.slow

@@ -71,9 +71,14 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
 
     Raises:
         ValueError: unknown onset, the onset term with RK4, or the model is not for MJX's JAX implementation.
-        TypeError: a second derivative with the onset term.
+        TypeError: other kinds of model and data, or a second derivative with the onset term.
     """
     _check_onset(onset)
+    if not (isinstance(model, mjx.Model) and isinstance(data, mjx.Data)):
+        given = f"{type(model).__name__} and {type(data).__name__}"
+        raise TypeError(
+            f"step takes an mjx.Model and mjx.Data, as mjx.put_model and mjx.make_data make them, not {given}"
+        )
     if model.impl != mjx.Impl.JAX:
         raise ValueError(f"only MJX's implementation in JAX has derivatives, this model is for {model.impl.value}")
     if onset != "none" and model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
