@@ -204,7 +204,7 @@ def _lines(rollout: Rollout, messages: tuple[str, ...], written: list[Path]) -> 
     lines.append(f"{facts['steps']} steps of {1e3 * model.opt.timestep:g} ms, {facts['duration']:g} s")
     rows = [[name, *(f"{value:.4f}" for value in place)] for name, place in facts["bodies"].items()]
     if rows:
-        lines += format_table(rows[:MOST_BODIES_LISTED], ["ended at", "x [m]", "y [m]", "z [m]"])
+        lines += format_table(rows[:MOST_BODIES_LISTED], ["centres of mass at the end", "x [m]", "y [m]", "z [m]"])
     if len(rows) > MOST_BODIES_LISTED:
         lines.append(f"and {len(rows) - MOST_BODIES_LISTED} more: --json lists them all")
     if 0 < model.njnt <= MOST_BODIES_LISTED:

@@ -111,7 +111,8 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
     for (above, below), model in zip(grid.T, models, strict=True):
         one = part.isel(model=model)
         t = one["position"].values
-        steepest = max(steepest, float(np.nanmax(np.abs(np.gradient(one["smoothed"].values, t)), initial=0.0)))
+        with np.errstate(all="ignore"):  # points may coincide
+            steepest = max(steepest, float(np.nanmax(np.abs(np.gradient(one["smoothed"].values, t)), initial=0.0)))
         above.plot(t, one["cost"], color="0.55", linewidth=1.2, label=LANDSCAPES["cost"].label)
         mean = _interval(one["smoothed"], one["smoothed_se"])
         line_with_band(above, t, *mean, color="black", marker="", label=LANDSCAPES["smoothed"].label)

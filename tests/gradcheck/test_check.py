@@ -53,7 +53,7 @@ def test_the_pusher_is_right(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_gradient_that_is_no_number_is_told_from_a_wrong_step() -> None:
     """Of a cost with a square root at 0, in the branch that is not taken."""
-    task = make_task("pusher").replace(horizon=3)
+    task = make_task("pusher", horizon=3)
     kinky = lambda state, control: jnp.where(control[0] > 5, jnp.sqrt(control[0] - 5), 0 * state.qpos[0])  # noqa: E731
     report = gradcheck(plan_gradcheck(task.replace(running_cost=kinky), ["mujoco_default"], None, seed=0, states=1))
     assert [check.verdict for check in report.costs] == ["nan"] and not any(each.fails for each in report.findings)
