@@ -88,10 +88,11 @@ class Family:
 
     def described(self, given: float | None, defaults: Iterable[float]) -> str:
         """The description with the damping that is in force [N s/m]: the one given, or else of the tasks."""
-        chosen = {given} if given is not None else set(defaults) if not self.dampratio else set[float]()
-        if not self.swept or not chosen - {0.0}:
-            return self.description if given is None else UNDAMPED.sub("without damping", self.description)
-        return UNDAMPED.sub(f"damped by {' or '.join(f'{each:g}' for each in sorted(chosen))} N s/m", self.description)
+        if given is None and self.dampratio:
+            return self.description
+        chosen = sorted(set(defaults)) if given is None else [given]
+        told = f"damped by {' or '.join(f'{each:g}' for each in chosen)} N s/m" if any(chosen) else "without damping"
+        return UNDAMPED.sub(told, self.description)
 
 
 def _constant(impedance: float) -> tuple[float, float, float, float, float]:

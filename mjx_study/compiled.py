@@ -109,12 +109,13 @@ class Compiled:
 
     def outputs(self, *arguments: Any, platform: str | None = None) -> Any:
         """Shapes and types of the outputs, from the function's trace; see `prepare` for the arguments."""
-        if platform in (None, jax.default_backend()):
-            key, types, form = self._form(arguments)
-            self._trace(key, types, form, arguments)
-            if traced := self._traced.get(key):
-                return traced[0]
-        ready = self.prepare(*arguments, platform=platform)
+        if platform not in (None, jax.default_backend()):
+            return jax.eval_shape(self._uncached(arguments), *arguments)
+        key, types, form = self._form(arguments)
+        self._trace(key, types, form, arguments)
+        if traced := self._traced.get(key):
+            return traced[0]
+        ready = self._ready[key]
         return ready.out_info if isinstance(ready, jax.stages.Compiled) else jax.eval_shape(ready, *arguments)
 
     def ahead(self, *types: Any, options: dict[str, Any] | None = None) -> Callable[[], None]:
