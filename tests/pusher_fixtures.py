@@ -8,9 +8,7 @@ impedance's effect on a result from a fault.
 
 import dataclasses
 import functools
-import json
 import warnings
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +24,6 @@ START = np.array([0.0, 1.0, 0.0, 0.0])
 HORIZON = 200
 SIGMA = 0.1
 NO_NOISE = 1e-150  # as a sigma: added to any control it is rounded away, and its square is no underflow
-DATA = json.loads((Path(__file__).parent / "data" / "published_rollouts.json").read_text())
 
 # Smooth controls (T, 1) [N] with different contact events, so results are stated for one of them by name.
 INPUTS = {

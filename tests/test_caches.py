@@ -12,7 +12,6 @@ from mjx_study.caches import digested, read_cached, undigested, write_cached
 from mjx_study.disk import private_folder
 from mjx_study.runtime import configure, traces_folder
 from tests.faults import NO_FILES, deadline, put_no_file
-from tests.processes import run_script
 
 
 def test_a_digest_is_checked() -> None:
@@ -94,44 +93,3 @@ def test_a_cache_that_others_can_write_to_is_not_used(
     assert traces_folder() == tmp_path / "mjx-study" / "traces"
     configure(**settings, cache="gs://bucket/cache")
     assert traces_folder() is None and jax.config.values["jax_compilation_cache_dir"] == "gs://bucket/cache"
-
-
-FLIPPED = """
-import random, sys
-from pathlib import Path
-import jax
-import mjx_study
-from jax._src import compilation_cache
-from mjx_study.caches import read_cached
-from mjx_study.objective import Simulator
-from mjx_study.tasks import make_task
-from tests.fuzz.flips import flipped
-
-folder, draw = Path(sys.argv[1]), random.Random(0)
-mjx_study.configure(cpu_devices=1, cache=folder)
-
-def evaluated():
-    jax.clear_caches()
-    compilation_cache.reset_cache()
-    task = make_task("pusher", horizon=2)
-    objective = Simulator(task, chunk_size=2).objective(None)
-    return objective.evaluate(task.theta, jax.random.split(jax.random.key(0), 2)).value.tolist()
-
-right = evaluated()
-kept = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-assert {path.parent.name for path in kept} - {"native"} == {"programs", "traces"}, kept.keys()
-assert all(path.stat().st_mode & 0o077 == 0 for path in folder.rglob("*"))
-assert evaluated() == right and all(path.read_bytes() == kept[path] for path in kept)
-for path, content in kept.items():
-    path.write_bytes(flipped(content, draw))
-assert evaluated() == right
-for path in kept:
-    assert path.parent.name != "traces" or read_cached(path) is not None  # made again
-print(len(kept))
-"""
-
-
-def test_with_bits_flipped_in_every_file_of_the_cache_the_numbers_are_the_same(tmp_path: Path) -> None:
-    """Programs, traces and libraries, none of which anybody else can read."""
-    done = run_script(FLIPPED, tmp_path / "cache")
-    assert int(done.stdout) > 2 and "Error reading persistent" not in done.stderr

@@ -4,7 +4,6 @@ import contextlib
 import io
 import json
 import os
-import re
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -12,7 +11,6 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.options.configuration import OPTIONS, as_arguments
-from mjx_study.plots.style import PAGE
 from mjx_study.results.rows import rows_of
 from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS
@@ -69,20 +67,6 @@ def test_figures_are_written_whole(small_run: tuple[Path, str]) -> None:
     assert (folder / "comparison.pdf").read_bytes().rstrip().endswith(b"%%EOF")
     numbers = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
     assert printed.endswith(f"written to {folder}: comparison.png, comparison.pdf, {numbers}\n")
-
-
-def test_what_compare_wrote_can_be_drawn_and_reported(
-    small_run: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder, _ = small_run
-    assert cli.main(["report", str(folder), "--output", str(tmp_path / "page.html")]) == 0
-    page = (tmp_path / "page.html").read_text()
-    assert "relative error" in page and "One seed; " in page and "Medians" not in page
-    assert cli.main(["plot", str(folder), "--output", str(tmp_path), "--style", "paper", "--format", "svg"]) == 0
-    assert "comparison.svg" in capsys.readouterr().out
-    picture = (tmp_path / "comparison.svg").read_text()
-    assert "<!-- AoBG -->" in picture and "<text" not in picture and "95 %" not in picture  # no fonts, no title
-    assert float(re.search(r'width="([\d.]+)pt"', picture).group(1)) == pytest.approx(72 * PAGE)  # type: ignore[union-attr]
 
 
 def test_warnings_about_the_contact_reach_the_reader(capsys: pytest.CaptureFixture[str]) -> None:

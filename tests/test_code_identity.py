@@ -8,7 +8,7 @@ import pytest
 
 from mjx_study.choices import KINDS
 from mjx_study.digest import FORMER, digest_of
-from mjx_study.identity import NOT_COMPUTING, computing_code, contents, differences
+from mjx_study.identity import NOT_COMPUTING, computing_code, contents
 from mjx_study.reference import MomentumTransfer
 from mjx_study.tasks import make_task
 from tests.test_layering import FILES, LAYERS, ROOT, module_of, read
@@ -104,8 +104,3 @@ def test_a_moved_class_keeps_its_digest() -> None:
     assert FORMER.keys() <= IMPORTS.keys() and not IMPORTS.keys() & set(FORMER.values())
     text = "class\0mjx_study.reference.launch\0MomentumTransfer\0\n"
     assert digest_of(MomentumTransfer) == hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def test_folders_of_other_code_are_refused_in_a_line() -> None:
-    """Those of versions whose digest covered plots and commands are, too."""
-    assert differences({"code of mjx-study": "0" * 12}, {"code of mjx-study": "1" * 12}) == "code of mjx-study differs"

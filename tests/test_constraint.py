@@ -72,8 +72,8 @@ def test_forces_and_imbalance_are_those_of_mjx(laws) -> None:
     for qacc in random_accelerations(run, scene.host.nv):
         slack, inverse_regularisation, ours, theirs, imbalance, gradient, _ = map(np.asarray, run(qacc))
         scale = np.abs(inverse_regularisation * slack).max()
-        np.testing.assert_allclose(ours, theirs, atol=1e-14 * scale)
-        np.testing.assert_allclose(imbalance, gradient, atol=1e-13 * max(scale, np.abs(gradient).max()))
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-14 * scale)
+        np.testing.assert_allclose(imbalance, gradient, rtol=0, atol=1e-13 * max(scale, np.abs(gradient).max()))
         forces.append(ours)
         linear = np.isclose(ours, -inverse_regularisation * slack, rtol=1e-9, atol=0)
         seen.append(np.where(ours == 0, 0, np.where(linear, 1, 2)))
@@ -120,8 +120,8 @@ def test_the_elliptic_law_is_the_gradient_of_a_convex_cost() -> None:
         force, slope = np.asarray(law(jnp.asarray(slack))), np.asarray(jax.jacfwd(law)(jnp.asarray(slack)))
         normal = mu * slack[0]
         sliding += bool(mu * normal + length > 0 and normal < mu * length)
-        np.testing.assert_allclose(slope, slope.T, atol=1e-13)
-        np.testing.assert_allclose(slope @ slack, force, atol=1e-13)
+        np.testing.assert_allclose(slope, slope.T, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(slope @ slack, force, rtol=0, atol=1e-13)
         assert np.linalg.eigvalsh(slope).max() < 1e-12
         assert np.linalg.norm(force[1:] / friction) <= force[0] + 1e-12  # within the cone
     assert sliding >= 4

@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, MIN_IMPEDANCE
-from mjx_study.simulation import constraint
+from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import (
     ContactModel,
@@ -78,12 +77,6 @@ def normal_acceleration(request):
 STIFFNESS, DAMPING, SPEED = 5e3, 30.0, -0.04  # N/m, N s/m, m/s
 
 
-def in_units(scene, impedance: float) -> ContactModel:
-    mass = effective_mass(scene, "floor", "ball")
-    solref = solref_from_stiffness(STIFFNESS, DAMPING, effective_mass=mass)
-    return contact_model(solref, constant(impedance), scene=scene)
-
-
 @pytest.mark.parametrize(("k", "b"), [(50.0, 0.0), (400.0, 3.0), (0.0, 199.0), (1e4, 100.0)])
 def test_a_contact_is_stable_where_its_step_does_not_grow(k: float, b: float) -> None:
     """Against the eigenvalues of x' = x + h v', v' = v - h (k x + b v), on both sides of the limit."""
@@ -91,18 +84,6 @@ def test_a_contact_is_stable_where_its_step_does_not_grow(k: float, b: float) ->
         step = np.array([[1 - timestep**2 * k, timestep - timestep**2 * b], [-timestep * k, 1 - timestep * b]])
         grows = np.max(np.abs(np.linalg.eigvals(step))) > 1 + 1e-12
         assert stable((-k, -b), float(timestep)) != grows, timestep
-
-
-def test_the_penalty_limit_is_a_spring_and_a_damper(normal_acceleration) -> None:
-    """MJX's force is K penetration - B velocity, up to 1 + (g - 1) d of the cone's edges: 5.4e-4 at mu = 0.5."""
-    kind, scene, acceleration = normal_acceleration
-    force = STIFFNESS * PENETRATION - DAMPING * SPEED
-    for impedance in (MIN_IMPEDANCE, 1e-3, 1e-2, 0.5):
-        measured = MASS * acceleration(in_units(scene, impedance), SPEED, 0.0)
-        exact = force / (1 + (edges_gain(kind) - 1) * impedance)
-        assert measured == pytest.approx(exact, rel=1e-10)
-        if impedance == MIN_IMPEDANCE:
-            assert measured == pytest.approx(force, rel=1e-3)
 
 
 @pytest.mark.parametrize("impedance", [1e-3, 0.5, 0.9])
@@ -204,15 +185,12 @@ def test_what_is_not_given_stays_the_mjcfs() -> None:
     ("change", "message"),
     [
         ({"solref": (-1.0, 1.0)}, "mixes signs and MuJoCo would fall back"),
-        ({"solref": (1.0,)}, "solref must be two finite numbers"),
         ({"solref": (math.inf, 1.0)}, "solref must be two finite numbers"),
         ({"solimp": (0.9, 0.95)}, "solimp must be five finite numbers"),
         ({"solimp": (0.0, 0.95, 0.001, 0.5, 2.0)}, "solimp's d_0 is 0.0, and MuJoCo would clip it"),
-        ({"solimp": (0.9, 1.0, 0.001, 0.5, 2.0)}, "solimp's d_width is 1.0"),
         ({"solimp": (0.9, 0.95, 0.0, 0.5, 2.0)}, "solimp's width must be positive, in m; got 0.0"),
         ({"solimp": (0.9, 0.95, 0.001, 0.5, 0.5)}, "solimp's power must be at least 1, got 0.5"),
         ({"friction": (0.5, -0.1, 0.0)}, "friction must be three numbers >= 0"),
-        ({"friction": (math.nan, 0.1, 0.0)}, "friction must be three numbers >= 0"),
         ({"margin": -0.1}, "margin must be >= 0 m, got -0.1"),
     ],
 )
@@ -226,7 +204,6 @@ def test_bad_contact_models_are_refused(change, message: str) -> None:
     ("arguments", "message"),
     [
         ({"stiffness": 0.0}, "stiffness must be positive and finite, in N/m; got 0.0"),
-        ({"stiffness": math.inf}, "stiffness must be positive and finite"),
         ({"effective_mass": 0.0}, "effective mass must be positive and finite, in kg; got 0.0"),
         ({"damping": -1.0}, "damping must be >= 0 and finite, in N s/m; got -1.0"),
         ({"dampratio": -1.0}, "damping ratio must be >= 0 and finite; got -1.0"),
@@ -317,19 +294,6 @@ def test_the_stability_limit(pressed, relative_damping: float) -> None:
     assert below < 6  # 1 / sqrt(1 - 0.96) = 5: the largest transient of the undamped map
     assert above > 0.3 * roots[1] ** 24
     assert above > below
-
-
-def test_rows_exist_where_contact_begins() -> None:
-    """A ball 1 mm above the plane is in contact under a margin of 1.1 mm and not under one of 0.9 mm."""
-    scene = scene_of(floor_scene(slider(1, height=0.101), None, 'condim="1"'))
-
-    def force(contact):
-        data = mjx.forward(apply_contact(scene.model, contact), scene.template)
-        return constraint.constraint_force(scene.model, data, data.qacc)[2]
-
-    run = jax.jit(force)
-    near, far = (contact_model((-1000.0, 0.0), margin=m, scene=scene) for m in (0.0011, 0.0009))
-    assert float(run(near)) > 0 == float(run(far))
 
 
 @pytest.mark.parametrize(

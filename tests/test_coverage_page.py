@@ -29,7 +29,7 @@ def same(found: list[str], said: list[str]) -> None:
             assert one == other
 
 
-@pytest.mark.parametrize("kind", ["lognormal"])
+@pytest.mark.parametrize("kind", ["lognormal", "Student's t, 3 degrees"])
 def test_intervals_and_the_test_for_bias(kind: str) -> None:
     assert jax.config.read("jax_enable_x64")
     intervals, test = coverage.coverage_rows(kind, 10)

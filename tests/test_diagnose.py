@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from estimators import Circulation, Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
+from estimators import Circulation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
 from mjx_study.diagnose.advice import advise
 from mjx_study.diagnose.means import along_means
@@ -25,6 +25,7 @@ from mjx_study.gradcheck import Finding
 from mjx_study.objective import Simulator
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import mjcf_task
+from tests.estimators import objectives
 
 HELD_OUT = Path(__file__).parents[1] / "experiments" / "data" / "held_out"
 GRAVITY, HEIGHT, TIMESTEP = 9.81, 0.05, 0.002
@@ -189,27 +190,10 @@ def test_the_error_after_a_second_is_that_of_its_samples() -> None:
     assert planted().error(0.0) == math.inf
 
 
-class Sideways:
-    """10 x + step(y): the derivative is right along the mean gradient, nearly, and misses all of it at right angles."""
-
-    num_params = 2
-
-    def _at(self, theta: Any, keys: Any) -> Any:
-        noise = 0.1 * jax.vmap(lambda key: jax.random.normal(key, (2,)))(keys)
-        at = theta + noise
-        return 10 * at[:, 0] + (at[:, 1] > 0), noise / 0.1**2
-
-    def evaluate(self, theta: Any, keys: Any) -> Evaluation:
-        values, scores = self._at(theta, keys)
-        return Evaluation(values, scores, jnp.zeros(len(keys)))
-
-    def differentiate(self, theta: Any, keys: Any) -> Differentiation:
-        values, scores = self._at(theta, keys)
-        return Differentiation(values, jnp.broadcast_to(jnp.array([10.0, 0.0]), scores.shape))
-
-
 def test_a_bias_at_right_angles_to_the_gradient_is_seen() -> None:
-    objective, chosen = Sideways(), [ZerothOrder(), FirstOrder()]
+    """10 x + step(y): the derivative is nearly right along the mean gradient, and misses all of it across."""
+    objective = objectives.OneStep(lambda x: 10 * x[0] + (x[1] > 0), 2, 0.1)
+    chosen = [ZerothOrder(), FirstOrder()]
     streams = jax.random.split(jax.random.key(1), 2)
     estimates = [estimate(each, objective, jnp.zeros(2), key, 2000) for each, key in zip(chosen, streams, strict=True)]
     gradient, aside = (path[0] for path in along_means(chosen[1:], objective, jnp.zeros(2), 0.2, estimates, 4000, 0))

@@ -52,13 +52,6 @@ def test_a_computation_is_never_silent_for_ten_seconds() -> None:
     assert watched.shown[-1][3] == "computing, 2 of 4, about 26 s left"  # cell 2 took 17 s; 8 have passed
 
 
-def test_the_only_piece_of_work_is_named_again() -> None:
-    watched = Watched()
-    watched.display.report(0, 1, "evaluating")
-    watched.wait(1)
-    assert watched.shown[-1][3] == "computing: evaluating"
-
-
 def test_counters_never_run_backwards_and_stages_are_not_repeated() -> None:
     watched = Watched()
     reports = [(10, 60, "descent; cost 3"), (30, 60, "descent; cost 2"), (20, 60, "descent; cost 1"), (60, 60, "end")]

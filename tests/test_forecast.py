@@ -32,11 +32,6 @@ def test_batches_of_gradients_are_counted() -> None:
     assert found.gradients == 2 * (3 * 8 + 100)
 
 
-def test_a_sweep_needs_no_folder_to_be_counted(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main("sweep pusher --contact reference --horizon 4 --samples 8 --seeds 1 --dry-run".split()) == 0
-    assert "rollouts" in capsys.readouterr().out
-
-
 def test_points_of_landscapes_are_counted() -> None:
     """5 points of 8 values, a baseline and 8 gradients; 1500 gradients of the quadrature in MJX alone."""
     config = StudyConfig(

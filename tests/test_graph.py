@@ -163,6 +163,7 @@ def test_the_value_is_the_functions(name, monkeypatch):
     """By every route."""
     points = np.stack([ROW, ROW[::-1], -2 * ROW, np.zeros(3) + 1])
     function = FUNCTIONS[name]
+    assert scalars.captured_once(function, jax.ShapeDtypeStruct((3,), float)) is not None, "it would be left as it is"
     plain = jax.jit(jax.vmap(function))(points)
     for route in ROUTES:
         monkeypatch.setenv(SWITCH, route)

@@ -208,14 +208,6 @@ def test_a_load_that_hardly_moves_is_no_task() -> None:
     assert aim.role == "tip" and aim.distance > 0.01
 
 
-def test_a_goal_behind_is_a_negative_distance() -> None:
-    found = proposed(LEG)
-    back = dataclasses.replace(found, aim=dataclasses.replace(found.aim, side=-1))
-    for each, sign in ((found, ""), (back, "-")):
-        text = source_of_task(Path("leg.xml"), each)
-        assert f'description="move torso by {sign}{found.aim.distance:g} m along x; open-loop controls"' in text
-
-
 def test_a_learning_rate_lowers_the_cost() -> None:
     found = proposed(LEG)
     aim, drive, steps = found.aim, found.drive, found.horizon

@@ -53,10 +53,10 @@ def test_values_are_scipys_and_mjxs(angle: float, rotate) -> None:
         composed = Rotation.from_quat(start, scalar_first=True) * Rotation.from_rotvec(angle * axis)
         expected = composed.as_quat(scalar_first=True)
         # Two products of four terms each below 1, and one normalisation: some ten roundings.
-        np.testing.assert_allclose(turned, expected * np.sign(expected @ turned), atol=3e-15)
-        np.testing.assert_allclose(
-            turned, mjx_math.quat_integrate(jnp.asarray(start), jnp.asarray(angle * axis), jnp.asarray(1.0)), atol=3e-15
-        )
+        np.testing.assert_allclose(turned, expected * np.sign(expected @ turned), rtol=0, atol=3e-15)
+        theirs = mjx_math.quat_integrate(jnp.asarray(start), jnp.asarray(angle * axis), jnp.asarray(1.0))
+        stopped = angle / 2 if angle < 1e-8 else 0.0  # MJX leaves out what turns slower
+        np.testing.assert_allclose(turned, theirs, rtol=0, atol=3e-15 + stopped)
         assert abs(np.linalg.norm(turned) - 1) < 1e-15 * 2
 
 
@@ -85,8 +85,8 @@ def test_derivatives_are_exact_across_the_switch(angle: float, jacobians) -> Non
         exact = exact_derivative(angle * axis)
         # the trigonometric branch divides by the angle twice: a cancellation of up to eps / angle near the switch
         tolerance = 1e-15 + 4 * np.finfo(float).eps / max(angle, SWITCH)
-        np.testing.assert_allclose(forward[1], exact, atol=tolerance)
-        np.testing.assert_allclose(reverse[1], exact, atol=tolerance)
+        np.testing.assert_allclose(forward[1], exact, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(reverse[1], exact, rtol=0, atol=tolerance)
         assert np.all(np.isfinite(forward[0])) and np.all(np.isfinite(reverse[0]))
 
 
@@ -97,7 +97,7 @@ def test_derivative_with_respect_to_the_quaternion(jacobians, rotate) -> None:
         numeric = central_jacobian(lambda q, rotation=rotation: rotate(q, rotation), start, 1e-3)
         # Richardson at 1e-3: (1e-3)^4 / 120 and 1e-16 / 1e-3
         for derivative in jacobians(start, rotation):
-            np.testing.assert_allclose(derivative[0], numeric, atol=1e-11)
+            np.testing.assert_allclose(derivative[0], numeric, rtol=0, atol=1e-11)
 
 
 def test_every_joint_moves_as_in_mujoco() -> None:
@@ -107,12 +107,12 @@ def test_every_joint_moves_as_in_mujoco() -> None:
     ours = integrate_position(host, jnp.asarray(qpos), jnp.asarray(qvel), TIMESTEP)
     expected = qpos.copy()
     mujoco.mj_integratePos(host, expected, qvel, TIMESTEP)
-    np.testing.assert_allclose(ours, expected, atol=3e-15)
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=3e-15)
 
 
 @pytest.fixture(scope="module")
 def floating():
-    """Our step; Jacobians of it and of MJX's over (qpos, qvel) at rest, and their values."""
+    """Our step, its Jacobian over (qpos, qvel) at rest, and its value and MJX's."""
     scene = scene_of(FLOATING)
     rest = jnp.concatenate([scene.template.qpos, jnp.zeros(scene.host.nv)])
 
@@ -124,11 +124,8 @@ def floating():
         data = mjx.step(scene.model, scene.template.replace(qpos=qpos, qvel=qvel))
         return jnp.concatenate([data.qpos, data.qvel])
 
-    def slope(function, point):
-        return jax.jacrev(lambda x: (function(x),) * 2, has_aux=True)(point)
-
-    slopes = compiled(lambda x: tuple(slope(each, x) for each in (ours, stock)), rest)(rest)
-    return scene, rest, compiled(ours, rest), tuple(zip(*slopes, strict=True))
+    found = compiled(lambda x: (jax.jacrev(ours)(x), ours(x), stock(x)), rest)(rest)
+    return scene, rest, compiled(ours, rest), found
 
 
 def angular(scene) -> list[tuple[int, int]]:
@@ -140,17 +137,11 @@ def angular(scene) -> list[tuple[int, int]]:
 
 def test_at_rest_orientation_follows_angular_velocity(floating) -> None:
     """d qpos' / d angular velocity is half a timestep per component, by differences too."""
-    scene, rest, step, ((reverse, _), (ours, stock)) = floating
-    np.testing.assert_allclose(ours, stock, atol=1e-15)
+    scene, rest, step, (reverse, ours, stock) = floating
+    np.testing.assert_allclose(ours, stock, rtol=0, atol=1e-15)
     numeric = central_jacobian(step, np.asarray(rest), 1e-2)
     for row, column in angular(scene):
         for jacobian in (reverse, numeric):
             assert jacobian[row, column] == pytest.approx(TIMESTEP / 2, rel=1e-9)
     # qpos' of order 1 with rounding 1e-16 over a step of 1e-2; the curvature over 1e-2 is Richardson's (1e-2)^4
-    np.testing.assert_allclose(reverse, numeric, atol=1e-8)
-
-
-def test_mjx_still_loses_this_derivative(floating) -> None:
-    scene, _, _, ((_, stock), _) = floating
-    lost = [float(stock[row, column]) for row, column in angular(scene)]
-    assert lost == [0.0] * 6, f"MJX now differentiates rotations at rest ({lost}): say so where its fault is described"
+    np.testing.assert_allclose(reverse, numeric, rtol=0, atol=1e-8)

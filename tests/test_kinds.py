@@ -107,7 +107,7 @@ def test_a_cell_depends_on_no_other(studies: dict[str, Path], name: str) -> None
 
 
 @each_kind
-@pytest.mark.parametrize("moment", [1, 3])
+@pytest.mark.parametrize("moment", [1, 2])
 def test_a_killed_run_resumes_to_the_same_numbers(
     studies: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, moment: int
 ) -> None:
@@ -115,10 +115,9 @@ def test_a_killed_run_resumes_to_the_same_numbers(
     with monkeypatch.context() as patch:
         written = kill_after(patch, lambda path, count: count == moment)
         patch.setattr(descents, "SAVE_SECONDS", 0.0)
-        try:
+        with pytest.raises(Killed):
             run_study(config(name), tmp_path)
-        except Killed:
-            assert load_study(tmp_path).attrs["missing_cells"] or len(written) == len(list(tmp_path.glob("cells/*")))
+    assert load_study(tmp_path).attrs["missing_cells"] or len(written) == len(list(tmp_path.glob("cells/*")))
     assert same(run_study(config(name), tmp_path), load_study(studies[name]))
     assert not list(tmp_path.glob("cells/*.part.npz"))
 
@@ -145,8 +144,13 @@ def test_a_folder_of_another_study_is_refused_and_left_alone(copy: Path, name: s
     assert content(copy) == before
 
 
-@each_kind
-@pytest.mark.parametrize("damage", ["truncated", "flipped", "foreign", "nonsense", "swapped"])
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        *((name, "flipped") for name in STUDIES),
+        *(("blocks", each) for each in ("truncated", "foreign", "nonsense", "swapped")),
+    ],
+)
 def test_a_damaged_cell_is_refused_and_left_alone(copy: Path, tmp_path: Path, name: str, damage: str) -> None:
     path = copy / "cells" / "00001.npz"
     written, says = path.read_bytes(), "is damaged"

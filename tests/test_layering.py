@@ -4,7 +4,6 @@ import ast
 import re
 import tomllib
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -116,24 +115,6 @@ def test_a_cycle_is_found() -> None:
     assert cycle(imports) == ["mjx_study.cli.sweep", "mjx_study.cli.studies"]
     assert cycle(imports | {"mjx_study.cli.studies": set()}) == []
     assert cycle({"a": {"a"}}) == ["a"]
-
-
-def floors(imports: Mapping[str, set[str]]) -> dict[str, int]:
-    """Height of each module above those that import nothing of the others."""
-
-    @cache
-    def height(module: str) -> int:
-        return 1 + max((height(each) for each in imports[module] & imports.keys()), default=0)
-
-    return {module: height(module) for module in imports}
-
-
-def test_studies_stand_on_six_floors() -> None:
-    """Of their modules, at most six import each the next."""
-    packages = tuple(f"mjx_study.{name}." for name in ("experiment", "storage", "execution", "results"))
-    imports = {module: read(path) for path in FILES if (module := module_of(path)).startswith(packages)}
-    assert len(imports) > 20 and max(floors(imports).values()) <= 6
-    assert floors({"a": {"b", "elsewhere"}, "b": {"c"}, "c": set()}) == {"a": 3, "b": 2, "c": 1}
 
 
 @pytest.mark.parametrize(

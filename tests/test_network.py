@@ -25,7 +25,7 @@ def test_parameters_are_laid_out_layer_by_layer() -> None:
     theta = np.asarray(jax.random.normal(jax.random.key(0), (policy.num_params,)))
     x = np.array([0.3, -0.2, 0.9])
     state = State(jnp.asarray(x), jnp.zeros(3), jnp.zeros(0), jnp.zeros(3))
-    first, second = np.tanh(x @ theta[:12].reshape(3, 4) + theta[12:16]), None
+    first = np.tanh(x @ theta[:12].reshape(3, 4) + theta[12:16])
     second = np.tanh(first @ theta[16:28].reshape(4, 3) + theta[28:31])
     expected = second @ theta[31:37].reshape(3, 2) + theta[37:]
     np.testing.assert_allclose(policy.feedback(jnp.asarray(theta), state), expected, rtol=1e-12)
@@ -73,7 +73,3 @@ def test_a_network_is_optimised_and_replayed(capsys: pytest.CaptureFixture[str],
     facts = json.loads(capsys.readouterr().out)
     assert facts["theta"] == json.loads(policy.read_text())["theta"] and len(facts["theta"]) == 25
     assert facts["cost"] < document["start_cost"][0]
-    assert cli.main(["optimise", "pusher", "--network", "4", "--reference"]) == 2
-    assert "--network needs MJX" in capsys.readouterr().err
-    assert cli.main(["optimise", "pusher", "--network", "wide"]) == 2
-    assert "--network must be a whole number, got 'wide'" in capsys.readouterr().err

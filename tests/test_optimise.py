@@ -175,14 +175,6 @@ def test_every_task_has_a_recipe_that_plans(task: str) -> None:
     assert group.recipe == group.task.defaults.recipe and planned.cells[0].samples == group.task.defaults.recipe.samples  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("name", ["sgd", "adam", "rmsprop", "adamw"])
-def test_any_optimiser_of_optax(name: str) -> None:
-    optimizer = make_optimizer(name, 0.1, 0.5)
-    state = optimizer.init(jnp.ones(2))
-    update, _ = optimizer.update(jnp.ones(2), state, jnp.ones(2))
-    assert np.all(np.asarray(update) < 0)
-
-
 def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     bare = make_task("pusher", horizon=3).replace(defaults=StudyDefaults(), reference=None)
     monkeypatch.setattr(plan, "task_with_options", lambda *_, **__: bare)

@@ -145,7 +145,9 @@ def test_findings_report_its_bias(capsys: pytest.CaptureFixture[str]) -> None:
     found = json.loads(capsys.readouterr().out)["findings"]
     (told,) = (sentence for sentence in found if "mean is" in sentence)
     assert told.startswith("reference: Doubled's mean is biased by") and re.search(r"\b10\b.*\b100 N/m", told)
-    for share, error in re.findall(r"([\d.]+) ± ([\d.]+) %", told):
+    shares = re.findall(r"([\d.]+) ± ([\d.]+) %", told)
+    assert shares
+    for share, error in shares:
         assert abs(float(share) - 100) < 3 * float(error) < 60
 
 

@@ -38,22 +38,6 @@ def hop(horizon=3, **options):
     return Task(name="hop", scene=scene, horizon=horizon, policy=policy, theta=jnp.zeros(horizon), sigma=1.0,
                 start=initial_state(scene), contact_pair=("pusher", "slider"), final_cost=lambda state: state.qpos[1])
 """
-CART = '''
-import mujoco
-from mjx_study import StudyDefaults, put_scene
-
-def cart(horizon=3):
-    scene, policy = put_scene(mujoco.MjModel.from_xml_string("""
-        <mujoco><worldbody><body name="cart">
-          <joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/>
-        </body></worldbody><actuator><motor joint="x"/></actuator></mujoco>
-    """), "cart"), OpenLoop(horizon, 1)
-    return Task(name="cart", scene=scene, horizon=horizon, policy=policy, theta=jnp.ones(horizon), sigma=1.0,
-                start=initial_state(scene, qpos=jnp.ones(1)), final_cost=lambda state: state.qpos[0]**2,
-                running_cost=lambda state, control: control @ control, contact_pair=None,
-                defaults=StudyDefaults(families=("mjcf",)))
-'''
-"""A task without contact, which compiles faster, in a single file."""
 
 
 @pytest.fixture(autouse=True)
@@ -110,7 +94,7 @@ def refused(name: str, **options: Any) -> str:
 def task(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Its file is in the current directory."""
     path = tmp_path_factory.mktemp("small")
-    (path / "mine.py").write_text(TINY + CART)
+    (path / "mine.py").write_text("from tests.carts import cart\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(path)
         yield "mine:cart"

@@ -93,11 +93,3 @@ def test_the_citation_has_this_version() -> None:
 def test_every_task_and_family_is_explained() -> None:
     assert all(f"`{name}`" in README for name in TASKS)
     assert all(f"| `{name}` |" in README for name in FAMILIES)
-
-
-def test_every_target_exists() -> None:
-    makefile = (ROOT / "Makefile").read_text()
-    targets = re.findall(r"^make (\w+)", "".join(blocks("sh")), re.MULTILINE)
-    assert targets == ["demo", "test"]
-    for target in targets:
-        assert re.search(rf"^{target}:", makefile, re.MULTILINE)

@@ -44,8 +44,8 @@ def test_stiffness_damping_and_impedance_are_the_c_engines(solref, solimp) -> No
 def test_both_quaternions_of_an_orientation_are_one() -> None:
     start, end = (jnp.array(part) / np.linalg.norm(part) for part in ([0.9, 0.1, -0.3, 0.2], [0.2, 0.7, 0.4, -0.1]))
     expected = patches.rotation_difference(end, start)
-    np.testing.assert_allclose(patches.rotation_difference(-end, start), expected, atol=1e-15)
-    np.testing.assert_allclose(patches.rotation_difference(end, -start), expected, atol=1e-15)
+    np.testing.assert_allclose(patches.rotation_difference(-end, start), expected, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(patches.rotation_difference(end, -start), expected, rtol=0, atol=1e-15)
 
 
 @settings(deadline=None, max_examples=60, derandomize=True)
@@ -89,18 +89,20 @@ def test_rotations_are_mjxs(numbers: list[float]) -> None:
     first, second = (jnp.array(part / np.linalg.norm(part)) for part in parts)
     axis, angle = original("math", "quat_to_axis_angle")(first)
     ours, one = patches.rotation_vector(first)
-    np.testing.assert_allclose(turned(np.asarray(ours * one)), turned(np.asarray(axis * angle)), atol=1e-10)
+    np.testing.assert_allclose(turned(np.asarray(ours * one)), turned(np.asarray(axis * angle)), rtol=0, atol=1e-10)
     assert np.linalg.norm(ours) <= np.pi + 1e-12
     difference = patches.rotation_difference(second, first)
     theirs = original("math", "quat_sub")(second, first)
-    np.testing.assert_allclose(turned(np.asarray(difference)), turned(np.asarray(theirs)), atol=1e-10)
+    np.testing.assert_allclose(turned(np.asarray(difference)), turned(np.asarray(theirs)), rtol=0, atol=1e-10)
 
 
 def test_a_rotation_has_its_derivative_at_no_angle() -> None:
     still = jnp.array([1.0, 0, 0, 0])
     right = np.concatenate([np.zeros((3, 1)), 2 * np.eye(3)], axis=1)  # sin(angle / 2) is half the angle
-    np.testing.assert_allclose(jax.jacfwd(lambda q: patches.rotation_vector(q)[0])(still), right, atol=1e-15)
-    np.testing.assert_allclose(jax.jacrev(lambda q: patches.rotation_difference(q, still))(still), right, atol=1e-15)
+    np.testing.assert_allclose(jax.jacfwd(lambda q: patches.rotation_vector(q)[0])(still), right, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        jax.jacrev(lambda q: patches.rotation_difference(q, still))(still), right, rtol=0, atol=1e-15
+    )
 
 
 def test_mjxs_own_functions_are_back_afterwards() -> None:
@@ -126,7 +128,7 @@ def test_levels_of_a_chain_are_not_fused() -> None:
     apart = [each for each in jax.make_jaxpr(places)(data).eqns if each.primitive.name == "optimization_barrier"]
     assert len(apart) == 4
     stock = jax.jit(lambda data: mjx.kinematics(mjx.put_model(model), data).xpos)(data)
-    np.testing.assert_allclose(jax.jit(places)(data).xpos, stock, atol=1e-15)
+    np.testing.assert_allclose(jax.jit(places)(data).xpos, stock, rtol=0, atol=1e-15)
 
 
 def test_other_threads_are_left_alone() -> None:
@@ -176,12 +178,12 @@ def test_contacts_of_cylinders(place: str) -> None:
     mjx_distance = original("collision_sdf", "_cylinder")
     ours, theirs = (jax.value_and_grad(distance) for distance in (patches.cylinder_distance, mjx_distance))
     for mine, its in zip(ours(point, size), theirs(point, size), strict=True):
-        np.testing.assert_allclose(mine, its, atol=1e-16)
+        np.testing.assert_allclose(mine, its, rtol=0, atol=1e-15)
     second, reverse = (mode(jax.grad(patches.cylinder_distance))(point, size) for mode in (jax.jacfwd, jax.jacrev))
-    np.testing.assert_allclose(reverse, second, atol=1e-12)
+    np.testing.assert_allclose(reverse, second, rtol=0, atol=1e-12)
     stock = jax.jacrev(jax.grad(mjx_distance))(point, size)
     assert np.isnan(stock).any() == (place in ("inside", "axis", "middle"))
     if place not in ("axis", "middle"):  # where the gradient jumps
         moved = [jax.grad(mjx_distance)(point + h, size) for h in 1e-6 * jnp.concatenate([jnp.eye(3), -jnp.eye(3)])]
         truth = (np.array(moved[:3]) - np.array(moved[3:])).T / 2e-6
-        np.testing.assert_allclose(second, truth, atol=1e-8)
+        np.testing.assert_allclose(second, truth, rtol=0, atol=1e-8)

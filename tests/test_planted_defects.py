@@ -25,7 +25,9 @@ def test_a_defect_can_be_planted(defect: Defect, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=f"{defect.name}: .* times"):
         plant(defect, tmp_path)
     for test in defect.tests:
-        assert (ROOT / test.split("::")[0]).is_file()
+        file, _, name = test.partition("::")
+        assert not name or f"def {name.partition('[')[0]}(" in (ROOT / file).read_text()
+        assert (ROOT / file).is_file()
     assert defect.model is None or defect.model in MODELS
 
 

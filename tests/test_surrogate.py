@@ -102,19 +102,6 @@ def test_a_study_has_every_backward_model_beside_the_exact_one() -> None:
             assert not np.any(variance[family, 1] == variance[other, 1])
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        ("linear_schedule(0.5, 2, 3)", "positive and at most 1 in all 3"),
-        ("exponential_dcay(1)", r"did you mean exponential_decay\?"),
-        ("linear_schedule(__import__('os'))", "cannot be read"),
-    ],
-)
-def test_a_schedule_that_cannot_be_used_is_refused(call: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        schedule_factors(call, 3, most=1.0)
-
-
 def test_factors_are_optaxs() -> None:
     np.testing.assert_allclose(schedule_factors("linear_schedule(0.1, 1, 2)", 4), [0.1, 0.55, 1, 1], rtol=1e-7)
     joined = "join_schedules([constant_schedule(0.5), exponential_decay(1.0, 1, decay_rate=0.5)], [2])"

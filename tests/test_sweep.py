@@ -214,15 +214,6 @@ def test_contact_models_in_mujocos_terms() -> None:
     assert models[0].stiffness == pytest.approx(stiffness_from_solref([-1000.0, -5.0], effective_mass=mass)[0])
 
 
-def test_a_sweep_that_is_complete_is_not_computed_again(
-    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = copy_of(undisturbed, tmp_path / "out")
-    assert cli.main(["sweep", *ARGUMENTS[:-2], "--output", str(folder), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["computed"] == 0 and told["cells"]["model"] == 4
-
-
 def test_the_example_of_the_page_runs(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (Path(__file__).parents[1] / "docs" / "studies.md").read_text()
     _, code = re.findall(r"```py\n(.*?)```", page, re.DOTALL)

@@ -89,15 +89,6 @@ def heaviside_gradient(theta: Array, sigma: float) -> Array:
     return norm.pdf(theta / sigma) / sigma
 
 
-def relaxed_heaviside(sigma: float, width: float) -> OneStep:
-    return OneStep(lambda x: jnp.clip(x[0] / width + 0.5, 0.0, 1.0), 1, sigma)
-
-
-def relaxed_heaviside_gradient(theta: Array, sigma: float, width: float) -> Array:
-    upper, lower = (theta + width / 2) / sigma, (theta - width / 2) / sigma
-    return (norm.cdf(upper) - norm.cdf(lower)) / width
-
-
 def linear(slope: np.ndarray, sigma: float) -> OneStep:
     return OneStep(lambda x: jnp.sum(jnp.asarray(slope, x.dtype) * x), len(slope), sigma)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from estimators import ESTIMATORS, make_estimator
+from estimators import make_estimator
 from estimators.mean_check import circulation, path_rule
 from mjx_study.reference import FunctionObjective, Heaviside
 from tests.estimators import objectives
@@ -23,7 +23,7 @@ def check(name: str, objective: Any, start=START, end=END, samples: int = 50_000
     return run(jax.random.key(0))
 
 
-@pytest.mark.parametrize("name", [name for name, each in ESTIMATORS.items() if each.unbiased != "no"])
+@pytest.mark.parametrize("name", ["zobg", "fobg", "ddcg"])
 def test_unbiased_estimators_pass_on_a_smooth_objective(name: str) -> None:
     """A quadratic, whose difference is known; a bias of a tenth would be found."""
     found = check(name, QUADRATIC)

@@ -1,6 +1,5 @@
 """Running estimators by name: oracles, keys, sharing, precision, transformations, refusals; and their page."""
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,11 +26,9 @@ from estimators import (
     draw,
     estimate,
     make_estimator,
-    zeroth_order,
 )
 from estimators.registry import markdown_table
 from tests.estimators import objectives
-from tests.estimators.statistics_helpers import assert_mean_is
 
 PAGE = (Path(__file__).parents[2] / "docs" / "estimators.md").read_text()
 
@@ -182,14 +179,6 @@ def test_leave_one_out_is_the_mean_of_the_other_finite_values():
     np.testing.assert_array_equal(leave_one_out(alone), [0.0, 2.0])
 
 
-def test_unknown_names_are_refused_with_the_choices():
-    zeroth, _ = lossy_batches()
-    with pytest.raises(ValueError, match=r"unknown estimator 'fogb'; did you mean fobg\?"):
-        estimate("fogb", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 10)
-    with pytest.raises(ValueError, match="unknown baseline 'mean'; choose from none, zero_noise, leave_one_out"):
-        zeroth_order(zeroth, "mean")
-
-
 class _Bare:
     """An objective with the two methods that every one has."""
 
@@ -245,14 +234,3 @@ def test_options_out_of_range_are_refused(name: str, change: dict[str, Any], mes
 def test_the_table_is_that_of_the_classes() -> None:
     assert markdown_table() in PAGE, f"put this table there:\n{markdown_table()}"
     assert all(f"`{name}`" in PAGE for name in (*BASELINES, *NOISES))
-
-
-def test_the_example_is_an_estimator() -> None:
-    """In under thirty lines; run like any other, and right where both of its parents are."""
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    assert len(code.splitlines()) < 30
-    module: dict[str, Any] = {"__name__": "my_estimators"}
-    exec(code, module)
-    objective = objectives.linear(np.array([1.0, -2.0]), 0.5)
-    found = estimate(module["SignAgreement"](), objective, jnp.zeros(2), jax.random.key(0), 2000)
-    assert_mean_is(found.per_sample + 1e-3 * jax.random.normal(jax.random.key(1), (2000, 2)), [1.0, -2.0])

@@ -225,21 +225,6 @@ def test_the_quantiles_of_student(freedom: float, inner: float, outer: float) ->
         assert -inner < found < (inner if probability <= 0.975 else outer)
 
 
-@pytest.mark.parametrize(("kind", "samples", "least"), [("lognormal", 10, 0.74), ("t_3", 10, 0.84), ("t_3", 50, 0.78)])
-def test_the_interval_covers_heavy_tails_better_than_with_normal_quantiles(
-    kind: str, samples: int, least: float
-) -> None:
-    """Normal quantiles: 0.64, 0.75 and 0.77. Within 4 standard errors of what docs/coverage.md says."""
-    trials = 4000
-    draw, exact = {
-        "lognormal": (lambda key: jnp.exp(jax.random.normal(key, (samples, 1))), (np.e - 1) * np.e),
-        "t_3": (lambda key: jax.random.t(key, 3.0, (samples, 1)), 3.0),
-    }[kind]
-    ends = jax.jit(jax.vmap(lambda key: variance_interval(summarise(draw(key)), 0.95)))
-    lower, upper = map(np.asarray, ends(jax.random.split(jax.random.key(3), trials)))
-    assert np.mean((lower <= exact) & (exact <= upper)) > least
-
-
 def test_a_direction_that_does_not_exist_is_nan():
     reference = summarise(jnp.array([[1.0, 0.0], [1.0, 2.0]]))
     comparison = compare(summarise(jnp.zeros((2, 2))), reference)

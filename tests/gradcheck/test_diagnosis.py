@@ -16,7 +16,6 @@ from mjx_study.gradcheck.diagnosis import (
     modes_apart,
     resolved_by,
     worst_error,
-    worst_verdict,
 )
 from mjx_study.gradcheck.differences import Differences
 from tests.scenes import scene_of
@@ -138,8 +137,3 @@ def test_modes_are_compared_by_rows_and_blocks() -> None:
     assert modes_apart(layout(), TRUE, other) == pytest.approx(1e-5, rel=1e-3)
     other[1, 2] = np.nan  # a finding of its own
     assert modes_apart(layout(), TRUE, other) == 0
-
-
-def test_the_worst_verdict() -> None:
-    assert worst_verdict([]) == "right"
-    assert worst_verdict(["kink", "zero", "jump"]) == "zero"

@@ -70,11 +70,6 @@ def test_a_tasks_own_states_come_first() -> None:
         np.testing.assert_array_equal(sample.state.qpos, visited[sample.index].qpos)
 
 
-def test_the_line_of_a_model_without_constraints_is_empty() -> None:
-    _, found = sampled('<body><joint type="slide"/><geom size=".1" mass="1"/></body>', 2)
-    assert found.line() == "" and found.missing == ()
-
-
 UPRIGHT = '<joint type="slide" axis="0 0 1"/>'
 
 

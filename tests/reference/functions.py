@@ -1,7 +1,6 @@
 """One table of the scalar functions, each at a generic point with a generic noise level."""
 
 import dataclasses
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,10 +8,8 @@ import numpy as np
 from mjx_study.reference import (
     BallWall,
     Heaviside,
-    Jump,
     MomentumTransfer,
     RelaxedHeaviside,
-    ScalarFunction,
     Smoothed,
 )
 
@@ -82,24 +79,3 @@ QUADRATIC = FunctionCase(
     0.7,
 )
 JUMPING = ("heaviside", "ball_wall", "momentum_transfer", "momentum_transfer, heavy ball")
-
-
-@dataclasses.dataclass(frozen=True)
-class WithoutClosedForm:
-    """A scalar function whose closed form is hidden, so that quadrature has to do."""
-
-    function: ScalarFunction
-    num_params: int = 1
-    period: float = math.inf
-
-    def value(self, x: np.ndarray) -> np.ndarray:
-        return self.function.value(x)
-
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        return self.function.gradient(x)
-
-    def jumps(self) -> tuple[Jump, ...]:
-        return self.function.jumps()
-
-    def breakpoints(self) -> tuple[float, ...]:
-        return self.function.breakpoints()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimators import first_order, zeroth_order
-from mjx_study.reference import ReferenceObjective, roll_out, value_and_gradients
+from mjx_study.reference import ReferenceObjective, value_and_gradients
 from tests.estimators.statistics_helpers import assert_mean_is, assert_variance_is
 from tests.reference.systems import linear_quadratic
 
@@ -20,15 +20,6 @@ OBJECTIVE = ReferenceObjective(SYSTEM, START, HORIZON, SIGMA)
 
 def keys(seed: int):
     return jax.random.split(jax.random.key(seed), SAMPLES)
-
-
-def test_the_quadratic_form_is_the_rollout_s_cost():
-    square, linear, constant = SYSTEM.quadratic_form(np.array(START), HORIZON)
-    for _ in range(3):
-        controls = RNG.standard_normal((HORIZON, 2))
-        theta = controls.ravel()
-        value = roll_out(SYSTEM, np.array(START), controls).value
-        assert theta @ square @ theta + 2 * linear @ theta + constant == pytest.approx(value, rel=1e-12)
 
 
 def test_smoothed_by_moments():

@@ -26,7 +26,6 @@ from mjx_study.reference import (
     roll_out,
     smoothed,
 )
-from tests.estimators import objectives
 from tests.estimators.statistics_helpers import assert_batches_agree, assert_mean_is
 from tests.reference.functions import FUNCTIONS, JUMPING, QUADRATIC, FunctionCase
 from tests.reference.systems import differentiate, linear_quadratic
@@ -60,19 +59,6 @@ def keys(count: int, seed: int = 0):
 
 def point(objective: Objective) -> jax.Array:
     return jnp.asarray(0.1 * np.random.default_rng(0).standard_normal(objective.num_params))
-
-
-@table
-def test_sample_depends_on_its_key_alone_and_both_orders_on_the_same_noise(name: str):
-    objective = OBJECTIVES[name]
-    theta = point(objective)
-    batch, derivative = objective.evaluate(theta, keys(6)), objective.differentiate(theta, keys(6))
-    assert batch.score.shape == derivative.gradient.shape == (6, objective.num_params)
-    np.testing.assert_array_equal(batch.value, derivative.value)
-    part, part_derivative = objective.evaluate(theta, keys(6)[2:4]), objective.differentiate(theta, keys(6)[2:4])
-    for whole, piece in ((batch.value, part.value), (batch.score, part.score), (batch.baseline, part.baseline)):
-        np.testing.assert_allclose(whole[2:4], piece, rtol=1e-12)
-    np.testing.assert_allclose(derivative.gradient[2:4], part_derivative.gradient, rtol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["controls", "controls, random start"])
@@ -130,20 +116,6 @@ def test_first_order_misses_exactly_the_jump_term(name: str):
     for wrong in (np.zeros(1), exact.jump_term, -0.9 * exact.jump_term):
         with pytest.raises(AssertionError, match="off by|no power"):
             assert_mean_is(bias, wrong, resolution=np.inf)
-
-
-@pytest.mark.parametrize("order", ["zeroth", "first"])
-def test_feedback_with_random_starts_is_unbiased(order: str):
-    """Against the recursion of the state's second moment, differentiated by JAX."""
-    theta = np.array([0.4, 0.1, 0.2, 0.5])
-    value, gradient = objectives.of_feedback(theta)
-    if order == "zeroth":
-        batch = objectives.FEEDBACK.evaluate(jnp.asarray(theta), keys(SAMPLES, 5))
-        assert_mean_is(np.asarray(batch.value)[:, None], [value])
-        estimate = zeroth_order(batch, "zero_noise")
-    else:
-        estimate = first_order(objectives.FEEDBACK.differentiate(jnp.asarray(theta), keys(SAMPLES, 6)))
-    assert_mean_is(estimate.per_sample, gradient)
 
 
 @pytest.mark.parametrize(
