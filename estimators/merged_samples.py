@@ -17,6 +17,7 @@ from estimators.pytree import register_pytree
 from estimators.samples import Deviations
 
 EXTREMES: Final = 32  # samples kept for each kind of extreme
+TINY: Final = float(np.finfo(float).tiny)  # fourth powers below it have lost digits
 MAX_THINNED: Final = 2**14
 """Maximum number of samples of a batch whose norms are kept; larger batches are subsampled at a regular stride."""
 
@@ -30,7 +31,7 @@ class Moments:
 
     A feature vector holds a sample's deviations d_i = g_i - gbar_i and their products d_i . d_j. A change of mean maps
     it affinely, so its scatter matrix, which holds all moments up to the fourth that the statistics need, can be
-    merged.
+    merged. Fourth moments may overflow where variances do not.
 
     Attributes:
         products: Means of d_i . d_j, i <= j, [cost^2/param^2].
@@ -50,6 +51,7 @@ class Moments:
     thinned: Float[np.ndarray, "some products"]
 
     @classmethod
+    @np.errstate(over="ignore", invalid="ignore")
     def of(cls, block: Block, first: int, every: int) -> "Moments":
         """Moments of a block whose first sample has index `first`; indices in `thinned` are multiples of `every`."""
         finite = np.all(np.isfinite(block), axis=(1, 2))
@@ -94,6 +96,7 @@ class Moments:
             if array.shape != shape or array.dtype.kind not in kinds:
                 raise ValueError(f"{name} has shape {array.shape} and type {array.dtype}")
 
+    @np.errstate(over="ignore", invalid="ignore")
     def merged(self, other: "Moments") -> "Moments":
         """Return the moments of both blocks together; the order affects rounding."""
         count = int(self.count + other.count)
@@ -177,6 +180,7 @@ class Merged:
       spread; the relative error is below that share, and about the largest share of any sample if there are no tails.
     - `norm_quantiles`: from at most `MAX_THINNED` thinned samples, so ranks have a standard error of 0.4 % (at the
       median); exact for fewer samples. The maximum is that of `top`.
+    - `concentration`, `log_spread`: NaN where fourth powers of the deviations leave the range of numbers.
     - `perturbed_means`: different draws from the same distribution.
 
     `size` is the number of samples per batch, nonfinite ones included.
@@ -222,19 +226,20 @@ class Merged:
 
     def deviations(self) -> Deviations:
         moments, product = self._moments, self._product
-        count, square = float(moments.count), float(product @ moments.products)
+        count, square = float(moments.count), product @ moments.products
         size = len(product)
-        squares = product @ moments.scatter[:size, :size] @ product + count * square**2
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = product @ moments.scatter[:size, :size] @ product + count * square**2
         total = count * square
         far = np.sum(self._weighed(moments.extremes - moments.mean) ** 2, axis=1)
         top = float(np.max(far, initial=0.0))
         eps = float(jnp.finfo(self.dtype).eps)
         varies = top > (8 * eps) ** 2 * (np.linalg.norm(self.mean) + np.sqrt(top)) ** 2
-        if count < 2 or not varies:
-            spread = squares = 0.0
-        else:
-            spread = _log_spread(count, far / total, float(squares / total**2), eps)
-        found = total, squares / total**2 if varies else 0.0, top / total if varies else 0.0, varies, spread
+        concentration = spread = 0.0
+        if count >= 2 and varies:
+            concentration = squares / total / total if TINY < squares < np.inf else np.nan
+            spread = _log_spread(count, far / total, float(concentration), eps)
+        found = total, concentration, top / total if varies else 0.0, varies, spread
         return Deviations(*map(jnp.asarray, found))
 
     def variance_along(self, direction: Float[Array, " params"]) -> Float[Array, ""]:

@@ -115,6 +115,15 @@ def test_equal_rows_in_blocks_have_zero_variance() -> None:
     np.testing.assert_array_equal(merged.mean, row)
 
 
+@pytest.mark.parametrize("scale", [1e-90, 1e80, 1e120])
+def test_fourth_powers_out_of_range_leave_the_variance(scale: float) -> None:
+    rows = scale * np.random.default_rng(0).normal(size=(100, 3))
+    (merged,) = merged_estimates(merge(moments_of([rows[:50]], 0, 1), moments_of([rows[50:]], 50, 1)), 100)
+    assert merged.variance == pytest.approx(float(summarise(jnp.asarray(rows)).variance), rel=1e-12)
+    assert np.isnan(estimators.effective_samples(merged).count)
+    assert np.all(np.isnan(estimators.variance_interval(merged, 0.9)))
+
+
 def test_blocks_without_a_finite_sample_count_for_nothing() -> None:
     rows = drawn("gaussian")
     empty = moments_of([np.full((BLOCK, PARAMS), np.nan)] * 2, 0, 1)
