@@ -22,8 +22,10 @@ from mjx_study import cli, initial_state, load_scene
 from mjx_study.authoring import proposal
 from mjx_study.authoring.proposal import Proposal, propose
 from mjx_study.authoring.task_file import function_name, source_of_task
+from mjx_study.authoring.trial import start_of
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.scene import put_scene
+from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task, check_shapes
 
@@ -152,6 +154,14 @@ def test_the_cost_is_that_of_the_test_rollouts(begin: Callable[..., Begun]) -> N
     effort = float(task.costs()[0](state, jnp.asarray(found.drive.neutral + change[0]))) * task.horizon
     assert float(task.costs()[1](last)) == pytest.approx(found.aim.misses(trial, task.horizon), rel=1e-9)
     assert effort == pytest.approx(proposal.WEIGHT * (0.3 / (10 * task.sigma)) ** 2)
+
+
+def test_a_keyframe_s_activations_are_kept(begin: Callable[..., Begun]) -> None:
+    """In the file, in its test rollouts and in the task of the MJCF alone."""
+    source = PENDULUM.replace("motor", 'general dyntype="filter" dynprm="0.1"')
+    task, *_ = begin(source.replace("</mujoco>", '<keyframe><key act="0.5" ctrl="0.5"/></keyframe></mujoco>'))
+    for start in (task.start, start_of(task.scene.host), scene_task(task.scene).start):
+        assert start.act.tolist() == [0.5]
 
 
 def test_what_a_task_is_about() -> None:

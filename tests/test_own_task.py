@@ -20,7 +20,7 @@ from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.experiment.plan import plan_study
 from mjx_study.gradcheck import plan_gradcheck
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.tasks import make_task
+from mjx_study.tasks import make_task, task_with_options
 from mjx_study.tasks.task import Task
 
 ROOT = Path(__file__).parents[1]
@@ -232,6 +232,12 @@ def test_what_is_no_task(source: str, says: str, write) -> None:
     assert refused("mine:hop", horizon=3).startswith(says)
 
 
+def test_a_timestep_brings_a_horizon(write) -> None:
+    write(f"{TINY}\ndef short(timestep=0.005): return hop(timestep=timestep)")
+    with pytest.raises(ValueError, match="keyword argument 'horizon'.*: a timestep comes with the horizon that keeps"):
+        task_with_options("mine:short", {"timestep": 0.0025})
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -239,6 +245,7 @@ def test_what_is_no_task(source: str, says: str, write) -> None:
         ("theta=jnp.zeros(3, jnp.float32)", "theta is float32, and the simulation float64"),
         ("final_cost=lambda state: state.qpos", "the final_cost has shape (2,), and a cost is a scalar"),
         ("running_cost=lambda state, control: control", "the running_cost has shape (1,), and a cost is a scalar"),
+        ("policy=type('Mute', (OpenLoop,), {'feedforward': print})(3, 1)", "the policy's feedforward returns a NoneTy"),
         ("final_cost=lambda state: state.position[0]", "the final_cost raised AttributeError: a state has qpos, qvel"),
         ("policy=InitialStatePolicy(3, 0, 3, lambda start, theta: 1 / 0)", "place raised ZeroDivisionError: division"),
         ("start=State(*map(jnp.zeros, (1, 2, 0, 2)))", "qpos of the start has shape (1,); the scene needs (2,)"),

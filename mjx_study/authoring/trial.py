@@ -68,7 +68,7 @@ def start_of(host: mujoco.MjModel) -> mujoco.MjData:
     """The first keyframe at time 0, or else the reference pose at rest."""
     data = mujoco.MjData(host)
     if host.nkey:
-        data.qpos[:], data.qvel[:] = host.key_qpos[0], host.key_qvel[0]
+        data.qpos[:], data.qvel[:], data.act[:] = host.key_qpos[0], host.key_qvel[0], host.key_act[0]
     mujoco.mj_forward(host, data)
     return data
 

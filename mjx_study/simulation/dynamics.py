@@ -80,19 +80,19 @@ class State:
             )
 
 
-def initial_state(scene: Scene, qpos: Qpos | None = None, qvel: Qvel | None = None) -> State:
+def initial_state(scene: Scene, qpos: Qpos | None = None, qvel: Qvel | None = None, act: Act | None = None) -> State:
     """Return a state at rest in the MJCF's reference pose, or at `qpos` [m or rad] and `qvel` [m/s or rad/s].
 
-    ValueError if their shapes are not the scene's.
+    Activations of actuators are 0 unless `act` gives them. A shape that is not the scene's is a ValueError.
     """
     like = scene.template
-    for name, given in (("qpos", qpos), ("qvel", qvel)):
+    for name, given in (("qpos", qpos), ("qvel", qvel), ("act", act)):
         if given is not None and jnp.shape(given) != (needed := getattr(like, name).shape):
             raise ValueError(f"{name} has shape {jnp.shape(given)}; the scene needs {needed}")
     return State(
         qpos=like.qpos if qpos is None else jnp.asarray(qpos, like.qpos.dtype),
         qvel=like.qvel if qvel is None else jnp.asarray(qvel, like.qvel.dtype),
-        act=like.act,
+        act=like.act if act is None else jnp.asarray(act, like.act.dtype),
         warmstart=jnp.zeros_like(like.qvel),
     )
 

@@ -119,6 +119,9 @@ def _check_arguments(place: str, builder: Callable[..., object], options: dict[s
     try:
         signature.bind(**options)
     except TypeError as error:
+        both = {"timestep", "horizon"} <= options.keys()
+        reason = "a timestep comes with the horizon that keeps the duration of rollouts; " if both else ""
         raise ValueError(
-            f"{place} does not take the options given ({error}): give it an argument for each, and others a default"
+            f"{place} does not take the options given ({error}): {reason}give it an argument for each, and others a "
+            "default"
         ) from None

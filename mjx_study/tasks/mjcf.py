@@ -43,7 +43,7 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     if host.nv == 0:
         raise ValueError(f"{scene.name} has no degree of freedom: there is nothing to study")
     key = host.nkey > 0
-    keyframe = (jnp.asarray(host.key_qpos[0]), jnp.asarray(host.key_qvel[0])) if key else ()
+    keyframe = map(jnp.asarray, (host.key_qpos[0], host.key_qvel[0], host.key_act[0])) if key else ()
     start = initial_state(scene, *keyframe)
     measured, what = _measured(host)
     origin = start.qpos[measured]
