@@ -139,7 +139,8 @@ class BiasTest:
 def bias_test(first: GradientEstimate, zeroth: GradientEstimate, key: Key[Array, ""], *, num_draws: int) -> BiasTest:
     """Two-sample test of equal means of a first-order and a zeroth-order estimate.
 
-        T = ||gbar_1 - gbar_0||,   T* = ||z_1 - z_0||,   z_k = sqrt(nu_k / chi^2_k) sum_i e_ki (g_ki - gbar_k) / n_k
+        T = ||gbar_1 - gbar_0||,   T* = ||z_1 - z_0||,
+        z_k = sqrt(nu_k / chi^2_k) sum_i e_ki (g_ki - gbar_k) / sqrt(n_k (n_k - 1))
 
     with independent standard normal multipliers e_ki, and chi^2_k with nu_k degrees of freedom. The p-value is the
     share of T* that reach T, with T itself counted as a draw: a multiplier bootstrap, which needs no inverse covariance

@@ -134,7 +134,7 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
         pairs = dataset.get("reference_pairs", xr.DataArray(config["reference_samples"])).values
         lines += [
             f"Errors are against an unbiased zeroth-order reference gradient, {_range(pairs, '{:,.0f}'.format)} pairs "
-            "of rollouts with a control variate;",
+            "of rollouts;",
             f"its own relative uncertainty is {_range(uncertainty, partial(number, digits=2))}: errors of that size "
             "are expected without any bias.",
             MARKS,

@@ -74,9 +74,9 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
 def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = (), *, own_program: bool = False) -> int:
     """Choose the chunk size for `samples` and their baseline.
 
-    On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the middle one for up to `MANY`; for a program of such
-    batches alone, one of `IN_TURN`, or, through XLA, all that the largest holds; `IN_NUMPY` for half of the middle one
-    or more. On accelerators, the size that needs the fewest calls (at least one per device), evenly filled, with at
+    On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the middle one for fewer than `MANY`; for a program of
+    such batches alone, one of `IN_TURN`, or, through XLA, all that the largest holds; `IN_NUMPY` for half of the middle
+    one or more. On accelerators, the size that needs the fewest calls (at least one per device), evenly filled, with at
     most as many samples as task gradients fit into `MAX_SHARE` of the memory.
     """
     platform = devices[0].platform
