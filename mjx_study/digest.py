@@ -49,6 +49,9 @@ IMPLIED: Final = frozenset(
 """Attributes that say nothing beyond names and source."""
 LATER: Final = "later"
 """Key in the metadata of fields that were added to a dataclass, so that digests of the version before are kept."""
+HELD_LATER: Final = {("mjx_study.tasks.sliding_box", "system"), ("mjx_study.tasks.tennis", "system")}
+"""Variables that functions of a module have held since a later version, and that are left out, so that digests of the
+version before are kept: they follow from the scene, which is digested by itself."""
 FORMER: Final = {
     "mjx_study.reference.projectiles": "mjx_study.reference.launch",
     "estimators.batches": "estimators.types",
@@ -270,11 +273,12 @@ class Digest:
 
 
 def _closure(function: types.FunctionType) -> dict[str, Any]:
-    """Variables captured by a function, by name."""
+    """Variables captured by a function, by name, except those `HELD_LATER`."""
     held = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         with suppress(ValueError):  # a cell that is still empty
-            held[name] = cell.cell_contents
+            if (function.__module__, name) not in HELD_LATER:
+                held[name] = cell.cell_contents
     return held
 
 

@@ -5,13 +5,16 @@ falls as 1 / sqrt(K); a rollout's compilation serves all stiffnesses of a task.
 """
 
 import math
+import re
 import warnings
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -19,7 +22,7 @@ from estimators.noise import split_sample_key
 from mjx_study.objective import simulate
 from mjx_study.reference import BallWall, MomentumTransfer, SlidingBox, Tennis, draw_start, roll_out
 from mjx_study.simulation.contact import ContactModel, ContactWarning
-from mjx_study.tasks import make_task
+from mjx_study.tasks import make_task, task_with_options
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
@@ -55,6 +58,31 @@ def contact(task: Task, family: str, stiffness: float) -> ContactModel:
 def rate(errors: np.ndarray, stiffness: tuple[float, ...]) -> np.ndarray:
     """Exponents p of error ~ K^p between neighbouring stiffnesses."""
     return np.diff(np.log(errors)) / np.diff(np.log(np.array(stiffness)))
+
+
+OUT_OF_CONTACT = {  # coordinates, where these and their velocities are in the reference's state, and its unit of time
+    "pusher": ([-1.0, 1.0], [0, 1], 1.0),
+    "sliding_box": ([0.5, 0.0, 0.0], [0, 2], 1.0),
+    "tennis": ([0.0, 2.0, 0.0, 0.0, 0.0], [0, 1], 10.0),
+}
+
+
+@pytest.mark.parametrize("name", OUT_OF_CONTACT)
+def test_a_reference_has_the_timestep_mass_and_damping_of_its_task(name: str, tmp_path: Path) -> None:
+    """One step of MuJoCo's is the reference's, and rollouts take as long."""
+    qpos, kept, scale = OUT_OF_CONTACT[name]
+    source = (Path(__file__).parents[1] / "models" / f"{name}.xml").read_text()
+    (tmp_path / "other.xml").write_text(re.sub(r'mass="(0\.1|1)"', 'mass="0.3"', source))
+    task = task_with_options(name, {"timestep": 0.0025, "model": str(tmp_path / "other.xml")})
+    reference, data = task.analytic(1000.0), mujoco.MjData(task.scene.host)
+    data.qpos[:], data.qvel[kept] = qpos, (0.7, -0.2)
+    state, control = np.zeros(reference.system.num_states), np.zeros(task.scene.host.nu)
+    state[:2], state[2:4] = data.qpos[kept], data.qvel[kept] / scale
+    control[0] = data.ctrl[0] = 0.1
+    mujoco.mj_step(task.scene.host, data)
+    np.testing.assert_allclose(reference.system.step(state, control)[2:4], data.qvel[kept] / scale, rtol=1e-12)
+    assert reference.horizon == task.horizon == 2 * make_task(name).horizon
+    assert reference.system.timestep == pytest.approx(scale * task.scene.timestep)
 
 
 # The ball and the wall

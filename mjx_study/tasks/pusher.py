@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from mjx_study.reference import Pusher, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import SceneOption, load_scene, require
+from mjx_study.simulation.scene import Scene, SceneOption, load_scene, require
 from mjx_study.tasks.policy import OpenLoop
 from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
@@ -59,8 +59,13 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
         running_cost=running_cost,
         final_cost=state_cost,
         contact_pair=("pusher", "slider"),
-        reference=lambda stiffness: ReferenceObjective(
-            Pusher(stiffness, timestep=scene.timestep), (*START, 0.0, 0.0), horizon, SIGMA
-        ),
+        reference=lambda stiffness: ReferenceObjective(_system(scene, stiffness), (*START, 0.0, 0.0), horizon, SIGMA),
         defaults=StudyDefaults(gamma=GAMMA, published=Published(GAMMA, RADIUS), recipe=RECIPE),
     )
+
+
+def _system(scene: Scene, stiffness: float) -> Pusher:
+    """The analytic system with the scene's timestep and its first body's mass and damping."""
+    mass = float(scene.host.dof_M0[0])
+    damping = 1 - scene.timestep * float(scene.host.dof_damping[0]) / mass
+    return Pusher(stiffness, timestep=scene.timestep, mass=mass, damping=damping)

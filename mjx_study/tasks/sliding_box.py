@@ -42,6 +42,7 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
     require(scene, joints=("block", "height", "box"), geoms=("foot", "box"), driven=("block",))
     dtype = scene.template.qpos.dtype
     edge = float(scene.host.geom_size[scene.geom("box")][0])
+    system = SlidingBox(width=edge, timestep=scene.timestep, mass=float(scene.host.dof_M0[BLOCK]))
     weight, goal = np.array(STATE_WEIGHT, dtype), np.array(GOAL, dtype)
 
     def state_cost(state: State) -> Float[Array, ""]:
@@ -67,11 +68,11 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
             "aboard": jnp.where(jnp.abs(states.qpos[-1, BLOCK] - states.qpos[-1, BOX]) < edge, 1.0, 0.0)
         },
         reference=lambda stiffness: ReferenceObjective(
-            SlidingBox(),
+            system,
             (0.0, 0.0, 0.0, 0.0),
             horizon,
             SIGMA,
-            metrics=lambda states: {"aboard": SlidingBox().on_box(states[..., -1, :]) * 1.0},
+            metrics=lambda states: {"aboard": system.on_box(states[..., -1, :]) * 1.0},
         ),
         defaults=StudyDefaults(
             gamma=GAMMA,

@@ -50,6 +50,8 @@ def tennis(
     require(scene, joints=joints, geoms=("ball", "paddle"), driven=joints[2:])
     dtype = scene.template.qpos.dtype
     weight, target = np.array(FINAL_WEIGHT, dtype), np.array(TARGET, dtype)
+    damping = 1 - scene.timestep * float(host.dof_damping[0] / host.dof_M0[0])
+    system = Tennis(timestep=TIME_SCALE * scene.timestep, damping=damping)
 
     def features(state: State) -> Float[Array, " features"]:
         """Ball position and slow velocity, paddle position and angle."""
@@ -74,7 +76,7 @@ def tennis(
         contact_pair=("ball", "paddle"),
         metrics=lambda states: tennis_metrics(states.qpos[:, :2], states.qvel[:, :2]),
         reference=lambda stiffness: ReferenceObjective(
-            Tennis(),
+            system,
             draw_start,
             horizon,
             SIGMA,
