@@ -12,6 +12,7 @@ import numpy as np
 
 from experiments.pages import markdown_row
 from mjx_study.claims.laboratory import EFFORTS, RELAXATIONS, Laboratory, Landscape, Slopes
+from mjx_study.reference import FinalCost
 from mjx_study.runtime import configure
 from mjx_study.table import markdown_table
 
@@ -25,8 +26,9 @@ TREATMENTS: dict[str, dict[str, str]] = {"exact": {}, "onset term": {"onset": "l
 
 def standard_deviation(at: Slopes) -> float:
     """Return the standard deviation of one first-order gradient, by quadrature over the landscape."""
-    table, sigma = at.objective.function, at.objective.sigma
-    assert isinstance(table, Landscape)
+    system, sigma = at.objective.system, at.objective.sigma
+    assert isinstance(system, FinalCost) and isinstance(system.function, Landscape)
+    table = system.function
     weight = np.exp(-0.5 * ((table.points - at.theta) / sigma) ** 2)
     mean = float(np.average(table.slopes, weights=weight))
     return math.sqrt(float(np.average((table.slopes - mean) ** 2, weights=weight)))

@@ -5,7 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-from mjx_study.reference import Reference
+from mjx_study.reference import ReferenceObjective
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
@@ -19,7 +19,7 @@ def poison(horizon: int = 5) -> Task:
     whole = task.reference
     assert whole is not None
 
-    def reference(stiffness: float) -> Reference:
+    def reference(stiffness: float) -> ReferenceObjective:
         if stiffness in (CRASH, RAISE):
             with Path(os.environ[ACCOUNT]).open("a") as file:
                 print(stiffness, file=file)

@@ -27,7 +27,7 @@ from mjx_study.experiment.quadrature import Line, applies, closed_form, grid, me
 from mjx_study.experiment.resolution import line_of
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
-from mjx_study.reference import BallWall, FunctionObjective, Heaviside, smoothed
+from mjx_study.reference import BallWall, FinalCost, Heaviside, smoothed
 from mjx_study.results.curves import curves_of
 from mjx_study.results.kind import findings_of
 from mjx_study.simulation.dynamics import State
@@ -136,11 +136,11 @@ def test_noise_reaches_quadrature_and_the_reference() -> None:
         (group,) = plan_study(study).groups
         assert group.task.noise == "laplace"
         reference = group.task.analytic(0.0)
-        assert isinstance(reference, FunctionObjective) and reference.noise == "laplace"
+        assert isinstance(reference.system, FinalCost) and reference.noise == "laplace"
         edge = np.array([np.pi / 4])
         found = closed_form(reference, edge)
         assert found is not None
-        (jump,) = [jump.size for jump in reference.function.jumps() if jump.position > 0]  # type: ignore[attr-defined]
+        (jump,) = [jump.size for jump in reference.system.function.jumps() if jump.position > 0]  # type: ignore[attr-defined]
         peak = np.sqrt(0.5) / task.sigma  # of Laplace's density; a Gaussian's is 0.4 / sigma
         assert found.slope - found.first == pytest.approx(jump * peak, rel=1e-9)
 

@@ -26,7 +26,7 @@ from mjx_study.execution.run import run_study
 from mjx_study.experiment.quadrature import Line, means
 from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.reference import FunctionObjective, smoothed
+from mjx_study.reference import FinalCost, ReferenceObjective, function_objective, smoothed
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.tasks import task_with_options
 from mjx_study.tasks.contact_grid import backward_grid, family_grid
@@ -154,7 +154,7 @@ class Slopes:
     gradient: float
     first: float
     errors: tuple[float, float]
-    objective: FunctionObjective
+    objective: ReferenceObjective
     theta: float
     points: int = 0
 
@@ -222,7 +222,7 @@ class Laboratory:
         """Task whose analytic system is its landscape under a family."""
         task = self.task(name)
         sigma, table = task.sigma, self.landscape(name, family, stiffness, low, high, task.sigma)
-        return task.replace(name=f"{name}, {family}", reference=lambda stiffness: FunctionObjective(table, sigma))
+        return task.replace(name=f"{name}, {family}", reference=lambda stiffness: function_objective(table, sigma))
 
     def slopes(
         self, name: str, family: str, theta: float, *, stiffness: float, sigma: float | None = None,
@@ -233,13 +233,13 @@ class Laboratory:
         sigma = task.sigma if sigma is None else sigma
         if family == REFERENCE:
             reference = task.analytic(stiffness)
-            assert isinstance(reference, FunctionObjective)
-            return closed_form(reference.function, theta, sigma)
+            assert isinstance(reference.system, FinalCost)
+            return closed_form(reference.system.function, theta, sigma)
         table = self.landscape(name, family, stiffness, theta, theta, sigma, timestep, onset, relaxed, smoothing)
         found = means(table.points, table.values, table.slopes, np.array([theta]), sigma, task.noise)
         slope, first = float(found.slope[0]), float(found.first[0])
         errors = float(found.slope_error[0]) / abs(slope), float(found.first_error[0]) / abs(slope)
-        return Slopes(slope, first, errors, FunctionObjective(table, sigma), theta, len(table.points))
+        return Slopes(slope, first, errors, function_objective(table, sigma), theta, len(table.points))
 
 
 def times_of(work: Callable[[], Any]) -> np.ndarray:
@@ -256,7 +256,7 @@ def times_of(work: Callable[[], Any]) -> np.ndarray:
 def closed_form(function: Any, theta: float, sigma: float) -> Slopes:
     exactly = smoothed(function, np.array([theta]), sigma)
     gradient, jump = float(exactly.gradient[0]), float(exactly.jump_term[0])
-    return Slopes(gradient, gradient - jump, (1e-12, 1e-12), FunctionObjective(function, sigma), theta)
+    return Slopes(gradient, gradient - jump, (1e-12, 1e-12), function_objective(function, sigma), theta)
 
 
 def batch(estimator: Estimator, at: Slopes, samples: int) -> GradientEstimate:

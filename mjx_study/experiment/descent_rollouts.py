@@ -27,7 +27,7 @@ from mjx_study.experiment.iteration import (
 from mjx_study.experiment.memory import padded_seeds
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.objective import Simulator, TracedObjective, chunk_for, natively, simulate
-from mjx_study.reference import Reference
+from mjx_study.reference import ReferenceObjective
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel, soften
 from mjx_study.simulation.observation import observed
@@ -152,7 +152,7 @@ class Backend:
     def _together(
         self,
         needs: Sequence[str],
-        reference: Reference,
+        reference: ReferenceObjective,
         theta: Float[Array, "seeds params"],
         keys: Key[Array, " seeds"],
     ) -> dict[str, Any]:

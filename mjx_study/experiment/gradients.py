@@ -51,7 +51,7 @@ from mjx_study.experiment.tally import Tally
 from mjx_study.limits import MOST_GIB
 from mjx_study.objective import BlankObjective, MjxObjective
 from mjx_study.options.option import OptionError
-from mjx_study.reference import Reference
+from mjx_study.reference import ReferenceObjective
 from mjx_study.results.findings import gradient_findings
 from mjx_study.results.kind import Drawing
 from mjx_study.results.rows import rows_of
@@ -305,7 +305,7 @@ class GradientComputation(Computation):
         """Call in order; on accelerators in a thread, while the next batches are sampled."""
         return done(call()) if jax.default_backend() == "cpu" else self._statistics.submit(call)
 
-    def _objective(self, cell: StudyCell) -> MjxObjective | Reference:
+    def _objective(self, cell: StudyCell) -> MjxObjective | ReferenceObjective:
         """The objective of a cell, with its programs compiled, so that measured times exclude compilation."""
         objective, theta = self._objectives(cell), self._plan.task_of(cell).theta
         if (program := self._plan.program_of(cell)) not in self._warm:
@@ -349,7 +349,7 @@ class GradientComputation(Computation):
         self._builds.wait()
 
     def _reference(
-        self, cell: StudyCell, objective: MjxObjective | Reference, pilot: Evaluation
+        self, cell: StudyCell, objective: MjxObjective | ReferenceObjective, pilot: Evaluation
     ) -> tuple[GradientEstimate, int]:
         """The reference gradient of a cell, and its number of pairs."""
         softened = cell.group, cell.sigma

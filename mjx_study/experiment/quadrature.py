@@ -23,7 +23,7 @@ from estimators import NOISES
 from estimators.noise import split_sample_key
 from mjx_study.compiled import Compiled
 from mjx_study.objective import rollout_cost, spread
-from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
+from mjx_study.reference import FinalCost, ReferenceObjective, ScalarFunction, smoothed
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.tasks.task import Task
@@ -54,11 +54,12 @@ class Means:
     first_error: Float[np.ndarray, " points"]
 
 
-def closed_form(reference: Reference, position: Float[np.ndarray, " points"]) -> Means | None:
+def closed_form(reference: ReferenceObjective, position: Float[np.ndarray, " points"]) -> Means | None:
     """Means of a function of one parameter; None for any other reference."""
-    if not isinstance(reference, FunctionObjective) or not isinstance(reference.function, ScalarFunction):
+    system = reference.system
+    if not isinstance(system, FinalCost) or not isinstance(system.function, ScalarFunction):
         return None
-    points = [smoothed(reference.function, np.array([t]), reference.sigma, reference.noise) for t in position]
+    points = [smoothed(system.function, np.array([t]), reference.sigma, reference.noise) for t in position]
     value, slope, jump = np.array([(point.value, point.gradient[0], point.jump_term[0]) for point in points]).T
     return Means(value, slope, slope - jump, np.zeros_like(slope), np.zeros_like(slope))
 

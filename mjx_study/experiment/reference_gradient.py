@@ -22,7 +22,7 @@ import estimators
 from estimators import Evaluation, GradientEstimate, delta_control_variate
 from mjx_study.experiment.memory import padded_size
 from mjx_study.objective import MjxObjective, Simulator
-from mjx_study.reference import Reference
+from mjx_study.reference import ReferenceObjective
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
@@ -79,7 +79,7 @@ def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples
 
 def candidates_of(
     task: Task,
-    objective: MjxObjective | Reference,
+    objective: MjxObjective | ReferenceObjective,
     keys: Key[Array, " samples"],
     soft: Float[Array, " params"] | None,
 ) -> Float[Array, "candidates params"] | None:
@@ -93,7 +93,7 @@ def candidates_of(
 
 def reference_of(
     task: Task,
-    objective: MjxObjective | Reference,
+    objective: MjxObjective | ReferenceObjective,
     keys: Key[Array, " pairs"],
     pilot: Evaluation,
     candidates: Float[Array, "candidates params"] | None,

@@ -15,7 +15,7 @@ from estimators import ORACLES, Linearisation
 from mjx_study.experiment.memory import LARGEST_BATCH, PADDED, padded_seeds, padded_size
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.objective import MjxObjective, Simulator
-from mjx_study.reference import Reference
+from mjx_study.reference import ReferenceObjective
 from mjx_study.tasks.task import Task
 
 
@@ -30,7 +30,7 @@ class Objectives:
             self._compiled[group] = Simulator(self._plan.groups[group].task, chunk_size=self._plan.chunk_size)
         return self._compiled[group]
 
-    def __call__(self, cell: StudyCell) -> MjxObjective | Reference:
+    def __call__(self, cell: StudyCell) -> MjxObjective | ReferenceObjective:
         if cell.model.analytic:
             return self._plan.groups[cell.group].task.replace(sigma=cell.sigma).analytic(cell.model.stiffness_or_zero)
         return self.simulator(cell.group).objective(cell.model.contact, cell.sigma)

@@ -15,12 +15,12 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.reference.system import ControlJacobians, Controls, Costs, StateJacobians, States
+from mjx_study.reference.system import ControlJacobians, Controls, FinalQuadraticCost, StateJacobians, States
 
 
 @dataclasses.dataclass(frozen=True)
-class DoublePendulum:
-    """State (q1, q2, v1, v2) [rad, rad/s]; no control; final cost |(q1, q2) - goal|^2.
+class DoublePendulum(FinalQuadraticCost):
+    """State (q1, q2, v1, v2) [rad, rad/s]; no control; final cost |(q1, q2)|^2 [rad^2].
 
     q1 is the first rod's angle from hanging straight down, q2 the second's relative to the first (MuJoCo's joint
     coordinate), so both are 0 at rest. Angles are never wrapped: the final state is smooth in the initial state.
@@ -30,14 +30,16 @@ class DoublePendulum:
         mass: mass of each point [kg].
         length: length of each rod [m].
         gravity: g [m/s^2].
-        goal: target angles [rad].
+        goal, state_weight, control_weight: as in `QuadraticCost`.
     """
 
     timestep: float = 0.001
     mass: float = 0.1
     length: float = 1.0
     gravity: float = 9.81
-    goal: tuple[float, float] = (0.0, 0.0)
+    goal: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    state_weight: tuple[float, ...] = (1.0, 1.0, 0.0, 0.0)
+    control_weight: float = 0.0
     num_states: int = 4
     num_controls: int = 0
 
@@ -80,21 +82,6 @@ class DoublePendulum:
             (lower, lower - cosine * v1**2 + sine * a1, -2 * sine * v1, np.zeros_like(v1)),
         )
         return self._solve(state, np.stack([np.stack(row, axis=-1) for row in rows], axis=-2))
-
-    def cost(self, state: States, control: Controls) -> Costs:
-        return np.zeros(state.shape[:-1])
-
-    def cost_gradients(self, state: States, control: Controls) -> tuple[States, Controls]:
-        return np.zeros(state.shape), np.zeros(control.shape)
-
-    def final_cost(self, state: States) -> Costs:
-        """|(q1, q2) - goal|^2 [rad^2]."""
-        return np.asarray(np.sum((state[..., :2] - np.array(self.goal)) ** 2, axis=-1))
-
-    def final_gradient(self, state: States) -> States:
-        """2 ((q1, q2) - goal), and 0 for the velocities."""
-        error = state[..., :2] - np.array(self.goal)
-        return np.concatenate([2 * error, np.zeros(error.shape)], axis=-1)
 
     def _rate(self, state):
         return np.concatenate([state[..., 2:], self.accelerations(state)], axis=-1)

@@ -3,14 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Final, Protocol, runtime_checkable
+from typing import Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from estimators import Differentiation, Evaluation, Linearisation, PairedObjective, StepDifferentiation, StepEvaluation
+from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from estimators.noise import batch_noise, check_density, check_sigma, noise_score, split_sample_key
 from mjx_study.reference.function import Function
 from mjx_study.reference.system import (
@@ -35,34 +35,47 @@ Theta = Float[Array, "*each params"]
 Keys = Key[Array, " samples"]
 
 
-@runtime_checkable
-class Reference(PairedObjective, Protocol):
-    """An Objective with hand-written derivatives that can also be evaluated without noise.
+@dataclasses.dataclass(frozen=True)
+class ReferenceObjective:
+    """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
 
     Methods that take keys also accept one theta per key.
+
+    `parametrises` determines the meaning of theta and where the noise acts:
+
+    - "controls": u_h = theta_h + w_h; theta is (horizon, controls), flattened.
+    - "feedback": u_h = Theta x_h + w_h; theta is the matrix Theta, (controls, states), flattened. Score
+      sum_h w_h x_h^T / sigma^2.
+    - "start": x_1 = theta + w, all controls 0; theta is the initial state.
+
+    Attributes:
+        start: initial state, or a function of a key that draws one; each sample then has its own zero-noise rollout as
+            baseline. None if theta is the initial state.
+        sigma: standard deviation of the noise, in the unit of the quantity it is added to.
+        noise: name of the noise density in `estimators.NOISES`.
+        metrics: function that computes named metrics from rollout states including the initial one; None for none.
     """
-
-    def value_and_gradient(
-        self, theta: Float[Array, " params"], key: Key[Array, ""]
-    ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """Zero-noise cost and its gradient, from the initial state drawn with `key` if it is random."""
-        ...
-
-    def observe(self, theta: Theta, keys: Keys) -> dict[str, np.ndarray]:
-        """Rollout metrics other than the cost, by name and sample; may be empty."""
-        ...
-
-
-class _Rollouts:
-    """Batches of rollouts of a policy on an analytic system; attributes as in `ReferenceObjective`."""
 
     system: System
     start: Start | None
     horizon: int
     sigma: float
-    parametrises: str
-    noise: str
-    metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None
+    parametrises: str = "controls"
+    noise: str = "gaussian"
+    metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
+
+    def __post_init__(self) -> None:
+        check_sigma(self.sigma)
+        check_density(self.noise)
+        if self.parametrises not in PARAMETRISATIONS:
+            raise ValueError(f"parametrises is {self.parametrises!r}; choose from {', '.join(PARAMETRISATIONS)}")
+        least = 0 if self.parametrises == "start" else 1
+        if self.horizon < least:
+            raise ValueError(f"horizon must be at least {least}, got {self.horizon}")
+        if (self.start is None) != (self.parametrises == "start"):
+            raise ValueError("give a start, or None if theta is the initial state")
+        if isinstance(self.start, tuple) and len(self.start) != self.system.num_states:
+            raise ValueError(f"the start must have {self.system.num_states} entries, got {len(self.start)}")
 
     def evaluate(self, theta: Theta, keys: Keys) -> Evaluation:
         return self._evaluation(theta, *self._draw(keys))
@@ -123,11 +136,13 @@ class _Rollouts:
         )
 
     def observe(self, theta: Theta, keys: Keys) -> dict[str, np.ndarray]:
+        """Rollout metrics other than the cost, by name and sample; may be empty."""
         return {} if self.metrics is None else self.metrics(self._roll_out(theta, *self._draw(keys)).states)
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
+        """Zero-noise cost and its gradient, from the initial state drawn with `key` if it is random."""
         start = np.asarray(self.start(split_sample_key(key)[0])) if callable(self.start) else self._fixed_start()
         value, gradient = self._differentiate(theta, start, np.zeros(self._noise_shape))
         return float(value), gradient.reshape(-1)
@@ -204,47 +219,7 @@ class _Rollouts:
 
 
 @dataclasses.dataclass(frozen=True)
-class ReferenceObjective(_Rollouts):
-    """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
-
-    `parametrises` determines the meaning of theta and where the noise acts:
-
-    - "controls": u_h = theta_h + w_h; theta is (horizon, controls), flattened.
-    - "feedback": u_h = Theta x_h + w_h; theta is the matrix Theta, (controls, states), flattened. Score
-      sum_h w_h x_h^T / sigma^2.
-    - "start": x_1 = theta + w, all controls 0; theta is the initial state.
-
-    Attributes:
-        start: initial state, or a function of a key that draws one; each sample then has its own zero-noise rollout as
-            baseline. None if theta is the initial state.
-        sigma: standard deviation of the noise, in the unit of the quantity it is added to.
-        noise: name of the noise density in `estimators.NOISES`.
-        metrics: function that computes named metrics from rollout states including the initial one; None for none.
-    """
-
-    system: System
-    start: Start | None
-    horizon: int
-    sigma: float
-    parametrises: str = "controls"
-    noise: str = "gaussian"
-    metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
-
-    def __post_init__(self) -> None:
-        check_sigma(self.sigma)
-        check_density(self.noise)
-        if self.parametrises not in PARAMETRISATIONS:
-            raise ValueError(f"parametrises is {self.parametrises!r}; choose from {', '.join(PARAMETRISATIONS)}")
-        if self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
-        if (self.start is None) != (self.parametrises == "start"):
-            raise ValueError("give a start, or None if theta is the initial state")
-        if isinstance(self.start, tuple) and len(self.start) != self.system.num_states:
-            raise ValueError(f"the start must have {self.system.num_states} entries, got {len(self.start)}")
-
-
-@dataclasses.dataclass(frozen=True)
-class _FinalCost:
+class FinalCost:
     """A system whose state is the argument of a function, its final cost; it takes no steps."""
 
     function: Function
@@ -273,24 +248,9 @@ class _FinalCost:
         return self.function.gradient(state)
 
 
-@dataclasses.dataclass(frozen=True)
-class FunctionObjective(_Rollouts):
+def function_objective(function: Function, sigma: float, noise: str = "gaussian") -> ReferenceObjective:
     """F(theta) = E f(theta + w) for a function of the parameters alone, with noise w of standard deviation sigma.
 
-    Its samples are rollouts without steps, from theta + w, with f as the final cost. There is no initial state to draw,
-    and there are no metrics.
-
-    Sigma is in the unit of theta.
+    Its samples are rollouts without steps, from theta + w, with f as the final cost. Sigma is in the unit of theta.
     """
-
-    function: Function
-    sigma: float
-    noise: str = "gaussian"
-    system: System = dataclasses.field(init=False, repr=False)
-
-    start, horizon, parametrises, metrics = None, 0, "start", None
-
-    def __post_init__(self) -> None:
-        check_sigma(self.sigma)
-        check_density(self.noise)
-        object.__setattr__(self, "system", _FinalCost(self.function))
+    return ReferenceObjective(FinalCost(function), None, 0, sigma, "start", noise)

@@ -66,6 +66,16 @@ class QuadraticCost:
         return 2 * np.array(self.state_weight) * (state - np.array(self.goal))
 
 
+class FinalQuadraticCost(QuadraticCost):
+    """c(x, u) = R |u|^2, and the final cost of `QuadraticCost`."""
+
+    def cost(self, state: States, control: Controls) -> Costs:
+        return np.asarray(self.control_weight * np.sum(control**2, axis=-1))
+
+    def cost_gradients(self, state: States, control: Controls) -> tuple[States, Controls]:
+        return np.zeros(state.shape), 2 * self.control_weight * control
+
+
 @dataclasses.dataclass(frozen=True)
 class Rollout:
     """A simulated batch.

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from mjx_study.reference.system import ControlJacobians, Controls, Costs, QuadraticCost, StateJacobians, States
+from mjx_study.reference.system import ControlJacobians, Controls, FinalQuadraticCost, StateJacobians, States
 
 MAX_TURNED: Final = 1e-3  # bound on the deviation of a velocity that was not reflected [rad]
 MAX_IMPACTS: Final = 4
@@ -48,10 +48,8 @@ Slopes = Float[np.ndarray, "samples 7 inputs"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Tennis(QuadraticCost):
+class Tennis(FinalQuadraticCost):
     """State (ball x, y, vx, vy, paddle x, y, angle) [m, m/s, rad]; control: the paddle's velocities [m/s, rad/s].
-
-    Running cost R |u|^2; final cost as in `QuadraticCost`.
 
     Attributes:
         timestep: h [s].
@@ -87,12 +85,6 @@ class Tennis(QuadraticCost):
         """Number of impacts within the step."""
         _, _, count = self._move(state, control, differentiate=False)
         return count
-
-    def cost(self, state: States, control: Controls) -> Costs:
-        return np.asarray(self.control_weight * np.sum(control**2, axis=-1))
-
-    def cost_gradients(self, state: States, control: Controls) -> tuple[States, Controls]:
-        return np.zeros(state.shape), 2 * self.control_weight * control
 
     def _move(self, state, control, *, differentiate: bool):
         """State after a step; on request, its Jacobian (..., 7, 10) over (state, control); impact counts."""

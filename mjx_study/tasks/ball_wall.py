@@ -16,7 +16,7 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjx_study.choices import unknown
-from mjx_study.reference import BallWall, FunctionObjective
+from mjx_study.reference import BallWall, function_objective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneError, SceneOption, load_model, put_scene, require
 from mjx_study.tasks.policy import InitialStatePolicy
@@ -75,7 +75,7 @@ def ball_wall(
         start=initial_state(scene),
         final_cost=lambda state: -((state.qpos[0] / LENGTH_SCALE) ** 2),
         contact_pair=("ball", "wall"),
-        reference=lambda stiffness: FunctionObjective(BallWall(), SIGMA),
+        reference=lambda stiffness: function_objective(BallWall(), SIGMA),
         defaults=StudyDefaults(
             gamma=GAMMA,
             published=Published(GAMMA, RADIUS),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study.reference import FunctionObjective, MomentumTransfer
+from mjx_study.reference import MomentumTransfer, function_objective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.policy import InitialStatePolicy
@@ -64,7 +64,7 @@ def momentum_transfer(
         start=initial_state(scene),
         final_cost=lambda state: -((inertia * state.qvel[2] / unit) ** 2),
         contact_pair=("ball", "bar"),
-        reference=lambda stiffness: FunctionObjective(elastic, SIGMA),
+        reference=lambda stiffness: function_objective(elastic, SIGMA),
         defaults=StudyDefaults(
             gamma=scale * GAMMA,
             published=Published(scale * GAMMA, scale * RADIUS),

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 from estimators.noise import check_density, check_sigma
 from estimators.user_code import describe_error
 from mjx_study.choices import TASK_DESCRIPTIONS
-from mjx_study.reference import Reference
+from mjx_study.reference import ReferenceObjective
 from mjx_study.simulation.contact import ContactModel, effective_mass
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.observation import ObservedState, observed
@@ -141,7 +141,7 @@ class Task:
     running_cost: Callable[[ObservedState, Float[Array, " nu"]], Float[Array, ""]] = no_cost
     final_cost: Callable[[ObservedState], Float[Array, ""]] = no_cost
     contact_pair: tuple[str, str] | None
-    reference: Callable[[float], Reference] | None = None
+    reference: Callable[[float], ReferenceObjective] | None = None
     noise: str = "gaussian"
     onset: str = "none"
     metrics: Callable[[ObservedState], dict[str, Float[Array, ""]]] | None = None
@@ -166,11 +166,11 @@ class Task:
         """Whether every sample draws its own initial state."""
         return not isinstance(self.start, State)
 
-    def analytic(self, stiffness: float) -> Reference:
+    def analytic(self, stiffness: float) -> ReferenceObjective:
         """The reference at a contact stiffness [N/m], with the task's noise; a ValueError if there is none."""
         if self.reference is None:
             raise ValueError(f"{self.name} has no analytic reference")
-        return dataclasses.replace(self.reference(stiffness), sigma=self.sigma, noise=self.noise)  # type: ignore[type-var]
+        return dataclasses.replace(self.reference(stiffness), sigma=self.sigma, noise=self.noise)
 
     @property
     def effective_mass(self) -> float:

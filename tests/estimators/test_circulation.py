@@ -10,7 +10,7 @@ import pytest
 
 from estimators import make_estimator
 from estimators.mean_check import circulation, path_rule
-from mjx_study.reference import FunctionObjective, Heaviside
+from mjx_study.reference import Heaviside, function_objective
 from tests.estimators import objectives
 
 QUADRATIC = objectives.quadratic(objectives.HESSIAN, 0.3)
@@ -40,7 +40,7 @@ def test_a_clip_is_found() -> None:
 
 
 def test_a_jump_is_found_without_a_reference_gradient() -> None:
-    objective = FunctionObjective(Heaviside(), 0.1)
+    objective = function_objective(Heaviside(), 0.1)
     ends = jnp.array([-0.05]), jnp.array([0.1])
     zeroth, first = (
         circulation(make_estimator(name), objective, *ends, jax.random.key(0), 4000) for name in ("zobg", "fobg")
