@@ -7,10 +7,8 @@ from estimators.batches import (
     GradientEstimate,
     Linearisation,
     Objective,
-    PairedObjective,
     StepDifferentiation,
     StepEvaluation,
-    StepwiseObjective,
     pull_back,
 )
 from estimators.builtin import (
@@ -48,18 +46,24 @@ from estimators.confidence import (
     variance_upper_bound,
 )
 from estimators.estimator import ESTIMATORS, Batches, Estimator, option, register
-from estimators.interpolation import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
-from estimators.mean_check import Circulation, circulation
+from estimators.interpolation import (
+    apply_choice,
+    choose_alpha,
+    constrained_alpha,
+    interpolate,
+    inverse_variance_alpha,
+    weigh_batches,
+)
+from estimators.mean_check import Circulation, circulations
 from estimators.noise import NOISES, NoiseDensity
 from estimators.recursion import total_propagation, truncated_first_order
 from estimators.registry import find_estimator, make_estimator, oracles_of
 from estimators.samples import Rows
 from estimators.sampling import draw, estimate
 from estimators.statistics import norm_quantiles, summarise
-from estimators.stepwise import antithetic_cost_to_go, cost_to_go, discontinuity_gated, stepwise_inverse_variance
+from estimators.stepwise import cost_to_go, discontinuity_gated, stepwise_inverse_variance
 from estimators.zeroth_first import (
     BASELINES,
-    antithetic,
     clipped_first_order,
     delta_control_variate,
     first_order,
@@ -74,13 +78,12 @@ __all__ = [
     "AlphaOrder", "Antithetic", "AntitheticCostToGo", "Batches", "BiasTest", "Circulation", "ClippedFirstOrder",
     "Comparison", "CostToGo", "DeltaMethod", "Differentiation", "DiscontinuityGated", "EffectiveSamples",
     "EmpiricalBias", "Estimator", "Evaluation", "FirstOrder", "GradientEstimate", "InverseVariance", "Linearisation",
-    "NoiseDensity", "Objective", "Oracle", "PairedObjective", "Rows", "StepDifferentiation", "StepEvaluation",
-    "StepwiseInverseVariance", "StepwiseObjective", "TotalPropagation", "TruncatedFirstOrder", "ZerothOrder",
-    "alpha_order", "antithetic", "antithetic_cost_to_go", "bernstein_epsilon", "bias_test", "circulation",
-    "clipped_first_order", "compare", "constrained_alpha", "cost_to_go", "coverage_interval", "delta_control_variate",
-    "discontinuity_gated", "draw", "effective_samples", "empirical_bias", "estimate", "find_estimator", "first_order",
-    "interpolate", "inverse_variance_alpha", "leave_one_out", "make_estimator", "none", "norm_quantiles", "option",
-    "oracles_of", "pull_back", "register", "squared_bias_of_means", "stepwise_inverse_variance", "summarise",
-    "total_propagation", "truncated_first_order", "variance_interval", "variance_upper_bound", "weigh_batches",
-    "zero_noise", "zeroth_order",
+    "NoiseDensity", "Objective", "Oracle", "Rows", "StepDifferentiation", "StepEvaluation", "StepwiseInverseVariance",
+    "TotalPropagation", "TruncatedFirstOrder", "ZerothOrder", "apply_choice", "bernstein_epsilon", "bias_test",
+    "choose_alpha", "circulations", "clipped_first_order", "compare", "constrained_alpha", "cost_to_go",
+    "coverage_interval", "delta_control_variate", "discontinuity_gated", "draw", "effective_samples", "empirical_bias",
+    "estimate", "find_estimator", "first_order", "interpolate", "inverse_variance_alpha", "leave_one_out",
+    "make_estimator", "none", "norm_quantiles", "option", "oracles_of", "pull_back", "register",
+    "squared_bias_of_means", "stepwise_inverse_variance", "summarise", "total_propagation", "truncated_first_order",
+    "variance_interval", "variance_upper_bound", "weigh_batches", "zero_noise", "zeroth_order",
 ]  # fmt: skip

@@ -143,6 +143,8 @@ class Objective(Protocol):
     """A stochastic objective F(theta) = E f(theta, w); most estimators need only these two methods.
 
     Sample i depends on `keys[i]` alone, so results do not depend on how samples are chunked or spread over devices.
+    Other estimators call further methods, named in `estimators.choices.ORACLES`; each takes the same arguments, and its
+    batches hold the samples of `evaluate` and `differentiate`, or pairs of these with opposite noise.
     """
 
     @property
@@ -156,34 +158,6 @@ class Objective(Protocol):
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Roll out and differentiate every sample with respect to theta."""
-        ...
-
-
-@runtime_checkable
-class PairedObjective(Objective, Protocol):
-    """An objective that can also be evaluated with opposite noise."""
-
-    def evaluate_pair(
-        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
-    ) -> tuple[Evaluation, Evaluation]:
-        """Return the batch of `evaluate` and one with opposite noise from the same starts."""
-        ...
-
-
-@runtime_checkable
-class StepwiseObjective(Objective, Protocol):
-    """An objective with stepwise batches; the samples are those of `evaluate` and `differentiate`."""
-
-    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
-        """Roll out without differentiating the dynamics, and keep the cost of each step."""
-        ...
-
-    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
-        """Roll out and differentiate every sample with respect to its noise."""
-        ...
-
-    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
-        """Roll out and keep the derivatives of every step."""
         ...
 
 

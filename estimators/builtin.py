@@ -45,11 +45,19 @@ class Interpolation(Baselined):
 
 
 class Paired(Baselined):
-    """Base of estimators with a batch of pairs of opposite noise."""
+    """Base of estimators over pairs of opposite noise: the mean of both halves, each with the baseline of its half.
+
+    A pair is one sample. Unbiased for symmetric noise. If the noise is added to theta itself, any baseline shared by a
+    pair cancels, and the part of f that is odd in the noise remains, ((f^+ - f^-) / 2) s^+: all of the signal without
+    the variance of the even part.
+    """
 
     def combine(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
+        from estimators.statistics import summarise
+
         (pair,) = args
-        return super().combine(*pair, **kwargs)
+        above, below = (super(Paired, self).combine(half, **kwargs).per_sample for half in pair)
+        return summarise((above + below) / 2.0)
 
 
 @register
@@ -71,7 +79,7 @@ class Antithetic(Paired):
     formula, unbiased = "the mean of `zobg` over the pair $`w, -w`$", "for symmetric noise"
     style = "#56B4E9", "v"
 
-    computes = "estimators.zeroth_first:antithetic"
+    computes = "estimators.zeroth_first:zeroth_order"
 
 
 @register
@@ -93,7 +101,7 @@ class AntitheticCostToGo(Paired):
     formula, unbiased = "the mean of `zobg_to_go` over the pair $`w, -w`$", "for symmetric noise"
     style = "#0072B2", "X"
 
-    computes = "estimators.stepwise:antithetic_cost_to_go"
+    computes = "estimators.stepwise:cost_to_go"
 
 
 @register
@@ -238,9 +246,9 @@ class InverseVariance(OneWeight):
     style = "#CC79A7", "^"
 
     def choose(self, zeroth: Any, first: Any) -> "estimators.batches.AlphaChoice":
-        from estimators.interpolation import inverse_variance_choice
+        from estimators.interpolation import choose_alpha
 
-        return inverse_variance_choice(zeroth, first)
+        return choose_alpha(zeroth, first)
 
 
 @register

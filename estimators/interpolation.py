@@ -1,5 +1,6 @@
 """Interpolation between zeroth- and first-order estimates: its weight, and weights plug-in or cross-fitted."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -102,51 +103,40 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
 
 
 def apply_choice(choice: AlphaChoice, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
-    """Interpolate with a chosen weight, and keep the choice."""
+    """Interpolate with a chosen weight, and keep the choice; variance and standard errors treat it as fixed."""
     return replace(interpolate(zeroth, first, choice.alpha), alpha=choice)
 
 
 def choose_alpha(
-    zeroth: GradientEstimate, first: GradientEstimate, *, gamma: float | Scalar, epsilon: float | Scalar
+    zeroth: GradientEstimate,
+    first: GradientEstimate,
+    *,
+    gamma: float | Scalar = math.inf,
+    epsilon: float | Scalar | None = None,
 ) -> AlphaChoice:
-    """Choose a weight with `constrained_alpha` and record its inputs; arguments as in `alpha_order`."""
-    discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
-    return AlphaChoice(
-        alpha=constrained_alpha(zeroth.variance, first.variance, discrepancy, epsilon, gamma),
-        epsilon=jnp.asarray(epsilon, zeroth.samples.dtype),
-        discrepancy=discrepancy,
-        variance_zeroth=zeroth.variance,
-        variance_first=first.variance,
-    )
+    """Choose the weight of an alpha-order batched gradient (AoBG) with `constrained_alpha`, and record its inputs.
 
-
-def inverse_variance_choice(zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
-    """Choose a weight with `inverse_variance_alpha` and record its inputs."""
-    alpha = inverse_variance_alpha(zeroth.variance, first.variance)
-    discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
-    return AlphaChoice(alpha, None, discrepancy, zeroth.variance, first.variance)
-
-
-def alpha_order(
-    zeroth: GradientEstimate, first: GradientEstimate, *, gamma: float | Scalar, epsilon: float | Scalar
-) -> GradientEstimate:
-    """Alpha-order batched gradient (AoBG) with the weight of `constrained_alpha`.
-
-    Assumes independent batches of the same size. The weight is computed from the samples it is applied to, which biases
-    the mean at order 1/N (`weigh_batches` avoids this). The variance and standard errors treat the weight as fixed.
+    Assumes independent batches of the same size. Applied to the samples it is computed from (`apply_choice`), the
+    weight biases the mean at order 1/N, which `weigh_batches` avoids.
 
     Args:
         zeroth: Zeroth-order estimate, assumed unbiased.
         first: First-order estimate from the same number of independent samples.
         gamma: Largest acceptable error, [cost/param]; infinity for inverse-variance weighting.
-        epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`.
-
-    Raises:
-        ValueError: The batches differ in shape.
+        epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`. None if gamma is
+            infinite.
 
     Reference: Suh et al. 2022, sec. "alpha-order gradient estimator".
     """
-    return apply_choice(choose_alpha(zeroth, first, gamma=gamma, epsilon=epsilon), zeroth, first)
+    discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
+    radius = 0.0 if epsilon is None else epsilon
+    return AlphaChoice(
+        alpha=constrained_alpha(zeroth.variance, first.variance, discrepancy, radius, gamma),
+        epsilon=None if epsilon is None else jnp.asarray(epsilon, zeroth.samples.dtype),
+        discrepancy=discrepancy,
+        variance_zeroth=zeroth.variance,
+        variance_first=first.variance,
+    )
 
 
 def weigh_batches(

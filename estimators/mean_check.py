@@ -16,7 +16,7 @@ from estimators.confidence import ENOUGH_EFFECTIVE, effective_samples
 from estimators.estimator import Estimator
 from estimators.pytree import register_pytree
 from estimators.registry import oracles_of
-from estimators.sampling import draw
+from estimators.sampling import draw, sample_keys
 from estimators.statistics import summarise
 
 NODES: Final = 9  # quadrature nodes along a path
@@ -28,7 +28,7 @@ Nodes = Float[np.ndarray, " nodes"]
 @register_pytree
 @dataclass(frozen=True)
 class Circulation:
-    """Path integral of an estimator's mean, compared with the difference of F. See `circulation`.
+    """Path integral of an estimator's mean, compared with the difference of F. See `circulations`.
 
     Attributes:
         difference: F(end) - F(start), [cost].
@@ -82,21 +82,6 @@ class Circulation:
         return max(rare, (HALF_WIDTH_SE * float(self.standard_error) / room) ** 2)
 
 
-def circulation(
-    estimator: Estimator,
-    objective: Objective,
-    start: Float[Array, " params"],
-    end: Float[Array, " params"],
-    key: Key[Array, ""],
-    num_samples: int,
-    *,
-    nodes: int = NODES,
-) -> Circulation:
-    """Integrate an estimator's mean along a path of theta; see `estimators.mean_check.circulations`."""
-    (found,) = circulations([estimator], objective, start, end, key, num_samples, nodes=nodes)
-    return found
-
-
 def circulations(
     estimators: Sequence[Estimator],
     objective: Objective,
@@ -136,7 +121,7 @@ def circulations(
         return jnp.stack([estimator(batches).per_sample @ step for estimator in estimators])
 
     def difference(order):
-        keys = jax.random.split(jax.random.split(jax.random.clone(key))[order], num_samples)
+        keys = sample_keys(jax.random.clone(key), num_samples)[order]
         first, last = (objective.evaluate(theta, jax.random.clone(keys)).value for theta in (start, end))
         return last - first
 

@@ -29,12 +29,6 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
     return summarise(pull_back(control_scores(steps, baseline), steps.policy_jacobian))
 
 
-def antithetic_cost_to_go(plus: StepEvaluation, minus: StepEvaluation, baseline: str) -> GradientEstimate:
-    """`cost_to_go` over pairs of opposite noise; each pair is one sample."""
-    above, below = (cost_to_go(steps, baseline).per_sample for steps in (plus, minus))
-    return summarise((above + below) / 2.0)
-
-
 def control_scores(steps: StepEvaluation, baseline: str) -> Controls:
     """grad psi(w_h^i) (V_h^i - b_h^i), a zeroth-order sample of dV/du_h, [cost/control]."""
     found = find_baseline(baseline)

@@ -71,21 +71,6 @@ def zeroth_order(evaluation: Evaluation, baseline: str) -> GradientEstimate:
     return summarise(advantage[:, None] * evaluation.score)
 
 
-def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEstimate:
-    """Zeroth-order batched gradient over pairs of opposite noise.
-
-        g_i = ((f_i^+ - b_i^+) s_i^+ + (f_i^- - b_i^-) s_i^-) / 2
-
-    A pair is one sample. Unbiased for symmetric noise. If the noise is added to theta itself, the two scores are
-    opposite, any baseline shared by a pair cancels, and the part of f that is odd in the noise remains,
-    ((f^+ - f^-) / 2) s^+: all of the signal without the variance of the even part.
-
-    `minus` has the starts of `plus` and the opposite noise; the baseline is applied within each half.
-    """
-    above, below = (zeroth_order(batch, baseline).per_sample for batch in (plus, minus))
-    return summarise((above + below) / 2.0)
-
-
 def delta_control_variate(
     evaluation: Evaluation, gradient: Float[Array, " params"], sigma: float | Float[Array, ""]
 ) -> GradientEstimate:

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Key
 from scipy import stats
 
 import mjx_study
-from estimators import Differentiation, Evaluation, FirstOrder, circulation
+from estimators import Differentiation, Evaluation, FirstOrder, circulations
 from mjx_study import differentiable_mjx
 from mjx_study.table import markdown_table
 
@@ -156,7 +156,7 @@ def means(environment: Any, onset: str, samples: int) -> Iterator[dict[str, floa
     along *= REACH / np.linalg.norm(along)
     objective, ends = Distance(environment, onset), (action - along, action + along)
     for seed in count():
-        number = circulation(FirstOrder(), objective, *ends, jax.random.key(seed), samples, nodes=NODES)
+        (number,) = circulations([FirstOrder()], objective, *ends, jax.random.key(seed), samples, nodes=NODES)
         yield {"seed": seed, "samples": samples} | {name: float(value) for name, value in vars(number).items()}
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from estimators import Evaluation, antithetic, effective_samples, squared_bias_of_means, variance_interval, zeroth_order
+from estimators import Antithetic, Evaluation, effective_samples, squared_bias_of_means, variance_interval, zeroth_order
 from estimators.noise import batch_noise, noise_score
 from estimators.statistics import summarise
 from experiments.atlas.design import COLUMNS, Cell, contact_of
@@ -157,7 +157,7 @@ def _statistics(plus: Evaluation, minus: Evaluation, pilot: Evaluation | None, g
     plain, *corrected = (summarise(gradients[:, which]) for which in range(gradients.shape[1]))
     kept = jnp.where(jnp.isfinite(plain.per_sample).all(axis=1)[:, None], plain.per_sample, jnp.nan)
     if pilot is None:
-        reference = antithetic(plus, minus, "zero_noise")
+        reference = Antithetic().combine((plus, minus))
     else:
         odd = dataclasses.replace(plus, value=(plus.value - minus.value) / 2, baseline=jnp.zeros_like(plus.value))
         reference = estimate_reference(odd, pilot, [jnp.nanmedian(kept, axis=0)], sigma)

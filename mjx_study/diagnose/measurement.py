@@ -2,7 +2,7 @@
 
 The error of an estimator after a second of computing is sqrt(bias^2 + variance x seconds per sample), relative to the
 gradient. The bias is the detectable deviation of the estimator's mean from the mean cost's slope along a path
-(`estimators.circulation`).
+(`estimators.circulations`).
 """
 
 import dataclasses

@@ -103,8 +103,7 @@ def reference_of(
     The pilot batch selects among the candidates, see `candidates_of`; neither shares keys with the other or the pairs.
     """
     if candidates is None or not isinstance(objective, MjxObjective):
-        plus, minus = objective.evaluate_pair(task.theta, keys)
-        return _antithetic(plus, minus, "zero_noise")
+        return _antithetic(objective.evaluate_pair(task.theta, keys))
     padding = padded_size(len(pilot.value)) - len(pilot.value)
     pilot = jax.tree.map(lambda leaf: np.pad(leaf, [(0, padding)] + [(0, 0)] * (leaf.ndim - 1)), pilot)
     return _reference_gradient(objective.evaluate_odd(task.theta, keys), pilot, candidates, objective.sigma)
@@ -151,7 +150,7 @@ def takes_candidates(task: Task) -> bool:
     return task.policy.additive and task.noise == "gaussian"
 
 
-_antithetic = jax.jit(estimators.antithetic, static_argnames="baseline")
+_antithetic = jax.jit(estimators.Antithetic().combine)
 
 
 @partial(jax.jit, static_argnames="sigma")

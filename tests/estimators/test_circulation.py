@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from estimators import make_estimator
-from estimators.mean_check import circulation, path_rule
+from estimators.mean_check import circulations, path_rule
 from mjx_study.reference import Heaviside, function_objective
 from tests.estimators import objectives
 
@@ -19,7 +19,7 @@ START, END = jnp.array([1.0, -1.5, 0.8]), jnp.array([1.6, -2.2, 1.3])
 
 def check(name: str, objective: Any, start=START, end=END, samples: int = 50_000, **options):
     estimator = make_estimator(name, **{"sigma": objective.sigma, "max_norm": 1e9, "window": 99} | options)
-    run = jax.jit(lambda key: circulation(estimator, objective, start, end, key, samples, nodes=5))
+    run = jax.jit(lambda key: circulations([estimator], objective, start, end, key, samples, nodes=5)[0])
     return run(jax.random.key(0))
 
 
@@ -42,9 +42,8 @@ def test_a_clip_is_found() -> None:
 def test_a_jump_is_found_without_a_reference_gradient() -> None:
     objective = function_objective(Heaviside(), 0.1)
     ends = jnp.array([-0.05]), jnp.array([0.1])
-    zeroth, first = (
-        circulation(make_estimator(name), objective, *ends, jax.random.key(0), 4000) for name in ("zobg", "fobg")
-    )
+    both = [make_estimator(name) for name in ("zobg", "fobg")]
+    zeroth, first = circulations(both, objective, *ends, jax.random.key(0), 4000)
     assert zeroth.verdict(0.2) == "right" and first.verdict() == "biased" and first.largest == 1.0
     np.testing.assert_allclose(first.gap, -first.difference, rtol=1e-12)
 
@@ -82,6 +81,6 @@ def test_a_path_too_long_for_its_nodes_is_not_judged_right() -> None:
 def test_meaningless_arguments_are_refused_by_circulation() -> None:
     fobg = make_estimator("fobg")
     with pytest.raises(ValueError, match="nodes must be an odd number; got 4"):
-        circulation(fobg, QUADRATIC, START, END, jax.random.key(0), 9, nodes=4)
+        circulations([fobg], QUADRATIC, START, END, jax.random.key(0), 9, nodes=4)
     with pytest.raises(ValueError, match="num_samples must be at least 2; got 1"):
-        circulation(fobg, QUADRATIC, START, END, jax.random.key(0), 1)
+        circulations([fobg], QUADRATIC, START, END, jax.random.key(0), 1)

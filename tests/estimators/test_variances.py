@@ -7,9 +7,9 @@ import pytest
 from jax import Array
 
 from estimators import (
+    Antithetic,
     Evaluation,
     StepEvaluation,
-    antithetic,
     cost_to_go,
     delta_control_variate,
     first_order,
@@ -81,7 +81,7 @@ def test_antithetic_pairs_leave_no_variance_of_curvature():
             jnp.asarray(value), jnp.asarray(sign * noise / SIGMA**2), jnp.full(SAMPLES, 0.5 * THETA @ HESSIAN @ THETA)
         )
 
-    pairs = antithetic(half(1.0), half(-1.0), "zero_noise")
+    pairs = Antithetic().combine((half(1.0), half(-1.0)))
     assert_variance_is(pairs, gradient, 4 * np.sum(gradient**2), resolution=0.06)
     single = zeroth_order(half(1.0), "zero_noise")
     assert_variance_is(single, gradient, zeroth_variance_of_quadratic(), resolution=0.06)
