@@ -61,11 +61,6 @@ class Simulator:
         """Return the objective for a contact model, with the task's noise level or another."""
         return MjxObjective(self, contact, self.task.sigma if sigma is None else sigma)
 
-    @property
-    def num_compilations(self) -> int:
-        """Number of programs compiled by this simulator so far."""
-        return sum(program.num_compilations for program in self._programs.values())
-
     def memory(self, kind: str, contact: ContactModel | None, samples: int) -> int:
         """XLA's planned temporary memory [bytes] for a batch of one kind, all chunks at once on all devices."""
         arguments = self._chunk(kind, self.task.theta, contact, 1.0)

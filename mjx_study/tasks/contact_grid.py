@@ -81,7 +81,10 @@ def family_grid(
     digits = digits_to_tell_apart(stiffnesses)
     for family in families:
         if family == REFERENCE:
-            check_reference(task)
+            if task.reference is None:
+                raise ValueError(f"{task.name} has no analytic reference")
+            if task.onset != "none":
+                raise OptionError("onset", "has no counterpart in the analytic references: omit it")
             found = stiffnesses if task.contact_pair is not None else (None,)
             points += [ContactPoint(family, stiffness, None, digits) for stiffness in found]
             continue
@@ -158,14 +161,6 @@ def backward_grid(
         found.append(dataclasses.replace(point, family=name, contact=contact))
         messages += [f"{found[-1].label}: {warning.message}" for warning in caught]
     return tuple(found), tuple(messages)
-
-
-def check_reference(task: Task) -> None:
-    """Raise ValueError unless the task has an analytic system that supports its first-order gradients."""
-    if task.reference is None:
-        raise ValueError(f"{task.name} has no analytic reference")
-    if task.onset != "none":
-        raise OptionError("onset", "has no counterpart in the analytic references: omit it")
 
 
 def solver_grid(task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]) -> Grid:
