@@ -93,7 +93,7 @@ def test_a_reference_draws_the_noise_that_mjx_draws() -> None:
     task = make_task("pusher", horizon=20).replace(noise="laplace")
     (cell,), _ = family_grid(task, ["penalty"], [100.0])
     assert task.reference is not None
-    reference = dataclasses.replace(task.reference(100.0), noise="laplace")  # type: ignore[type-var]
+    reference = dataclasses.replace(task.reference(100.0), noise="laplace")
     keys = jax.random.split(jax.random.key(2), 4)
     ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, keys)
     theirs = reference.evaluate(task.theta, jax.random.clone(keys))
