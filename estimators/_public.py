@@ -46,14 +46,7 @@ from estimators.confidence import (
     variance_upper_bound,
 )
 from estimators.estimator import ESTIMATORS, Batches, Estimator, option, register
-from estimators.interpolation import (
-    apply_choice,
-    choose_alpha,
-    constrained_alpha,
-    interpolate,
-    inverse_variance_alpha,
-    weigh_batches,
-)
+from estimators.interpolation import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
 from estimators.mean_check import Circulation, circulations
 from estimators.noise import NOISES, NoiseDensity
 from estimators.recursion import total_propagation, truncated_first_order
@@ -79,8 +72,8 @@ __all__ = [
     "Comparison", "CostToGo", "DeltaMethod", "Differentiation", "DiscontinuityGated", "EffectiveSamples",
     "EmpiricalBias", "Estimator", "Evaluation", "FirstOrder", "GradientEstimate", "InverseVariance", "Linearisation",
     "NoiseDensity", "Objective", "Oracle", "Rows", "StepDifferentiation", "StepEvaluation", "StepwiseInverseVariance",
-    "TotalPropagation", "TruncatedFirstOrder", "ZerothOrder", "apply_choice", "bernstein_epsilon", "bias_test",
-    "choose_alpha", "circulations", "clipped_first_order", "compare", "constrained_alpha", "cost_to_go",
+    "TotalPropagation", "TruncatedFirstOrder", "ZerothOrder", "alpha_order", "bernstein_epsilon",
+    "bias_test", "circulations", "clipped_first_order", "compare", "constrained_alpha", "cost_to_go",
     "coverage_interval", "delta_control_variate", "discontinuity_gated", "draw", "effective_samples", "empirical_bias",
     "estimate", "find_estimator", "first_order", "interpolate", "inverse_variance_alpha", "leave_one_out",
     "make_estimator", "none", "norm_quantiles", "option", "oracles_of", "pull_back", "register",

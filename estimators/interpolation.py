@@ -139,6 +139,13 @@ def choose_alpha(
     )
 
 
+def alpha_order(
+    zeroth: GradientEstimate, first: GradientEstimate, *, gamma: float | Scalar, epsilon: float | Scalar
+) -> GradientEstimate:
+    """Alpha-order batched gradient (AoBG), weighted by the samples that it averages; arguments of `choose_alpha`."""
+    return apply_choice(choose_alpha(zeroth, first, gamma=gamma, epsilon=epsilon), zeroth, first)
+
+
 def weigh_batches(
     choose: Callable[..., Any], mix: Callable[..., GradientEstimate], batches: Sequence[Any], weights: str
 ) -> GradientEstimate:

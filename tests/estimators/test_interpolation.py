@@ -1,14 +1,12 @@
 """The weight against a numerical minimum, its edge cases, and what the interpolated estimate promises."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import estimators
-from estimators import GradientEstimate, apply_choice, bernstein_epsilon, choose_alpha, first_order, zeroth_order
+from estimators import GradientEstimate, alpha_order, bernstein_epsilon, first_order, zeroth_order
 from tests.estimators import objectives
 
 # Compiled whole: a fraction of the time of compiling operation by operation.
@@ -19,10 +17,6 @@ interpolate = jax.jit(estimators.interpolate)
 
 INF, NAN = np.inf, np.nan
 EPS = float(np.finfo(np.float64).eps)
-
-
-def alpha_order(zeroth: GradientEstimate, first: GradientEstimate, **bound: Any) -> GradientEstimate:
-    return apply_choice(choose_alpha(zeroth, first, **bound), zeroth, first)
 
 
 def random_inputs(count: int) -> np.ndarray:
