@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -224,6 +225,7 @@ def test_policies_are_written_and_replayed(capsys: pytest.CaptureFixture[str], t
     """As they are, and without the digest as somebody changed them."""
     options = "--reference --horizon 8 --iterations 4 --seeds 2 --samples 4 --evaluation-samples 5 --output"
     assert cli.main(["optimise", "pusher", *options.split(), str(tmp_path)]) == 0
+    assert "pusher: analytic reference, K = 550 N/m; sgd" in capsys.readouterr().out
     policies = [tmp_path / f"policy-{name}.json" for name in ("zobg", "fobg", "aobg")]
     assert {path.name for path in tmp_path.iterdir()} >= {"descent.png", *(path.name for path in policies)}
     kept = json.loads(policies[1].read_text())
@@ -236,6 +238,34 @@ def test_policies_are_written_and_replayed(capsys: pytest.CaptureFixture[str], t
         assert cli.main(replay) == 0
         facts = json.loads(capsys.readouterr().out)
         assert facts["theta"] == kept["theta"] and facts["duration"] == pytest.approx(8 * timestep)
+
+
+HOP = """<mujoco><worldbody><body name="ball"><joint name="z" type="slide" axis="0 0 1"/><geom size=".1"/></body>
+</worldbody><actuator><motor joint="z"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("chosen", "offered"),
+    [
+        ("pusher --contact mujoco_default --network 128,128 --estimators zobg", True),
+        ("pusher --contact mujoco --backward smooth_onset --estimators fobg", True),
+        ("hop.xml --estimators zobg", False),
+    ],
+    ids=["a contact without stiffness, and many parameters", "surrogate gradients", "a file"],
+)
+def test_the_command_that_shows_the_best_policy_runs(
+    chosen: str, offered: bool, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it is printed; a file has none, for rollout moves it as its MJCF says."""
+    monkeypatch.chdir(tmp_path)
+    Path("hop.xml").write_text(HOP)
+    few = "--horizon 2 --iterations 1 --learning-rate 0.01 --samples 3 --seeds 1 --evaluation-samples 2 --output out"
+    assert cli.main(["optimise", *chosen.split(), *few.split()]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("to see the best policy: ")]
+    assert len(told) == offered
+    for line in told:
+        (program, *command) = shlex.split(line.removeprefix("to see the best policy: "))
+        assert program == "mjx-study" and cli.main([*command, "--renderer", "drawing", "--frames", "1"]) == 0
 
 
 def test_a_descent_that_ends_above_its_start_is_reported() -> None:

@@ -187,6 +187,7 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("gradcheck pusher --contact", "argument --contact: expected one argument"),
         ("gradcheck pusher --contact reference", "--contact does not accept 'reference'; choose from penalty"),
         ("gradcheck pusher --contact ,", "no contact model to check"),
+        ("gradcheck pusher --stiffness ,", "no contact model to check"),
         ("gradcheck pusher --contact mujoco_default --stiffness 3", "--stiffness has no effect on contact mujoco_def"),
         ("gradcheck pusher --pair a,b", "--pair is for files: a task has a pair of geoms already"),
         ("gradcheck pusher --window 9", "--window is for --mean"),
@@ -204,13 +205,29 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("rollout pusher --seed 3", "--seed has an effect only with --noisy, as the initial state is fixed"),
         ("rollout pusher --sigma 0.2", "--sigma has an effect only with --noisy"),
         ("rollout rod.xml --contact penalty --noisy", "--contact is for a task: rod.xml moves as its MJCF says"),
+        ("rollout rod.xml --damping 0", "--damping is for a task: rod.xml moves as its MJCF says"),
         ("claims --accept-versions", "--accept-versions needs the folder to resume: give --output"),
         ("claims --only nothing", "unknown claim 'nothing'; choose from "),
+        ("plot nowhere --format ,", "--format must have at least one value"),
         ("plot nowhere --format gif", "--format does not accept 'gif'; choose from png, pdf, svg"),
     ],
 )
 def test_a_command_line_is_refused(arguments: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert says in refused(shlex.split(arguments), capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "value"),
+    [
+        ("landscape pusher --span -2,2", (-2.0, 2.0)),
+        ("compare pusher --theta -.5,2", "-.5,2"),
+        ("sweep pusher --solref -1e5:-1e3:3:log;-10", ((-1e5, -10.0), (-1e4, -10.0), (-1e3, -10.0))),
+    ],
+)
+def test_a_list_may_begin_with_a_minus(arguments: str, value: Any) -> None:
+    command, *rest = arguments.split()
+    parsed = cli.parser(command).parse_args([command, *rest])
+    assert getattr(parsed, rest[1].removeprefix("--")) == value
 
 
 @pytest.mark.parametrize(

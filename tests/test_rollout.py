@@ -159,6 +159,15 @@ def test_a_policy_keeps_what_is_zero_and_not_what_is_none(capsys: pytest.Capture
     assert [stiffness for stiffness, _ in costs] == [100.0, 100.0, middle] and costs[0][1] != costs[1][1]
 
 
+def test_a_policy_is_shown_with_another_contact(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    """Which takes none of the options of the policy's own."""
+    policy = {"task": "pusher", "theta": [0.1, 0.1], "contact": "hunt_crossley", "horizon": 2}
+    policy |= {"stiffness": 100.0, "damping": 1.0, "smoothing": 1e-4}
+    (elsewhere / "policy.json").write_text(json.dumps(policy))
+    facts = document(capsys, "pusher", "--theta", "policy.json", "--frames", "1", "--contact", "mujoco_default")
+    assert facts["contact"] == "mujoco_default" and facts["stiffness"] != 100
+
+
 def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
     np.save(elsewhere / "theta.npy", np.full(10, 1e200))
     facts = document(capsys, *SHORT, "--theta", "theta.npy")

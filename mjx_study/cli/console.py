@@ -14,7 +14,7 @@ import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
 from estimators.registry import label_of
-from mjx_study.choices import FAMILIES, REFERENCE
+from mjx_study.choices import FAMILIES, REFERENCE, is_file
 from mjx_study.experiment.iteration import REASONS
 from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS
 from mjx_study.results.curves import curves_of, line_of
@@ -223,7 +223,7 @@ def _run(one: xr.Dataset) -> dict[str, Any]:
 def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     config, onset = document["config"], onset_of(dataset)
     where = "analytic reference" if config["contact"] == REFERENCE else config["contact"]
-    if config["contact"] != REFERENCE and config["stiffness"]:
+    if config["stiffness"]:
         where = f"{where}, K = {config['stiffness']:g} N/m"
     metrics = "".join(f", {name} {number(value, 3)}" for name, value in document["start_metrics"].items())
     decay = f" / i^{config['decay']:g}" if config["decay"] else ""
@@ -247,7 +247,7 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         for stop in run["stopped"]:
             label = label_of(run["estimator"], onset)
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
-    if paths := document.get("policies"):
+    if (paths := document.get("policies")) and not is_file(config["task"]):  # rollout moves a file as its MJCF says
         least = [np.nanmin(_finite(run["final_cost"]), initial=np.inf) for run in document["runs"]]
         best = shlex.join(["mjx-study", "rollout", config["task"], "--theta", paths[int(np.argmin(least))]])
         lines.append(f"to see the best policy: {best}")

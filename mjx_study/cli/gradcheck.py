@@ -83,10 +83,9 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 
-    given = [name for name in (*MEAN_OPTIONS, *DERIVATIVES, "theta") if getattr(options, name) not in (None, False)]
     with usage_errors():
         reject_unused(
-            given,
+            given_options(options, *MEAN_OPTIONS, *DERIVATIVES, "theta"),
             (DERIVATIVES, not options.mean, "is for derivatives of steps: omit it, or --mean"),
             (MEAN_OPTIONS, options.mean, "is for --mean"),
             (["pair"], is_file(options.task), "is for files: a task has a pair of geoms already"),

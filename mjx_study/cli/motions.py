@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_study import objective
-from mjx_study.choices import CONES, is_file
+from mjx_study.choices import CONES, is_file, laws_of, takes_stiffness
 from mjx_study.cli.options import configure_process, given_options, task_of, theta_and_policy, usage_errors
 from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
@@ -63,9 +63,8 @@ def run_rollout(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         check_format(options.format)
-        given = [name for name in (*OF_TASKS, "sigma") if getattr(options, name) not in (None, False)]
         reject_unused(
-            given,
+            given_options(options, *OF_TASKS),
             (OF_TASKS, not is_file(options.task), f"is for a task: {options.task} moves as its MJCF says"),
             (["sigma"], options.noisy, "has an effect only with --noisy"),
         )
@@ -94,6 +93,8 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
 
 def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
     theta, found = theta_and_policy(options)
+    if family := options.contact or found.get("contact"):
+        found = _taken(found, family)
     for name in ("contact", "stiffness", "damping", "smoothing", "timestep", *BUILDER_OPTIONS):
         if getattr(options, name) is None:
             setattr(options, name, found.get(name))
@@ -108,6 +109,13 @@ def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
         raise OptionError("seed", "has an effect only with --noisy, as the initial state is fixed")
     contact, messages = single_contact(task, options.contact, options.stiffness, options.damping, options.smoothing)
     return partial(_simulate_task, at_theta(task, theta), contact, options.seed or 0, options.noisy), messages
+
+
+def _taken(policy: dict[str, Any], family: str) -> dict[str, Any]:
+    """Options of a policy's file without those that a contact family, the policy's or another, does not take."""
+    spring = takes_stiffness([family])
+    takes = {"stiffness": spring, "damping": spring, "smoothing": bool(laws_of([family]))}
+    return {name: value for name, value in policy.items() if takes.get(name, True)}
 
 
 def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Rollout:

@@ -42,7 +42,7 @@ def refuse_unusable(given: Sequence[str]) -> None:
 def given_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Those of the named options that the command has and that were given."""
     found = {name: getattr(options, name, None) for name in names}
-    return {name: value for name, value in found.items() if value is not None}
+    return {name: value for name, value in found.items() if value is not None and value is not False}
 
 
 def study_fields(options: argparse.Namespace) -> dict[str, Any]:

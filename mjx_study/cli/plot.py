@@ -6,15 +6,15 @@ from pathlib import Path
 from mjx_study.choices import FIGURE_FORMATS, FIGURE_STYLES
 from mjx_study.cli.options import usage_errors
 from mjx_study.cli.output import attempt, print_report
-from mjx_study.options.option import Option
+from mjx_study.options.option import Option, OptionError
 from mjx_study.options.parser import Parser
 
 FORMAT = Option("format", str, "FORMAT", "of: {}", choices=FIGURE_FORMATS, many=True, default=("png", "pdf"))
 EPILOG = """\
-Draws every figure for which the study has numbers: variance, bias and alpha against stiffness, error against samples,
-maps over two swept parameters; for descents, achieved cost against stiffness, and cost against iterations, rollouts and
-seconds; for landscapes, costs and slopes. Works while the study is still being computed. --style paper gives column or
-page width, no title, and embedded 8-point type.
+Draws the figures for which the study has numbers, at most 12 of a kind: variance, bias and alpha against stiffness,
+error against samples, a map over stiffness and another swept parameter; for descents, achieved cost against stiffness,
+and cost against iterations, rollouts and seconds; for landscapes, costs and slopes. Works while the study is still
+being computed. --style paper gives column or page width, no title, and embedded 8-point type.
 
 examples:
   mjx-study plot out
@@ -39,6 +39,8 @@ def run(options: argparse.Namespace) -> int:
     from mjx_study.storage.folder import load_study
 
     with usage_errors():
+        if not options.format:
+            raise OptionError("format", "must have at least one value")
         dataset = load_study(options.folder)
         folder = prepare_folder(options.output or options.folder)
     with matplotlib.rc_context(STYLES[options.style]):

@@ -89,12 +89,12 @@ def plan_gradcheck(
         raise ValueError(f"states must be at least 1, got {states}")
     if families is None:
         families = ("mjcf",) if task.contact_pair is None else CONTACT
+    if not families or (stiffnesses is not None and not stiffnesses):
+        raise ValueError("no contact model to check: give at least one stiffness and one contact family")
     own = task.defaults.stiffnesses
     overlap = min(STIFFNESS) <= max(own) and min(own) <= max(STIFFNESS)
     usual = STIFFNESS if overlap else own
     cells, messages = family_grid(task, families, usual if stiffnesses is None else stiffnesses, damping, smoothing)
-    if not cells:
-        raise ValueError("no contact model to check: give at least one stiffness and one contact family")
     reject_untaken(families, stiffness=stiffnesses, damping=damping, smoothing=smoothing)
     if stock and (laws := laws_of(families)):
         raise OptionError("stock", f"is for MuJoCo's law, which {laws[0]} does not have: omit it")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Union, runtime_
 from estimators.choices import DENSITIES
 from estimators.registry import ESTIMATORS, options_of_estimators
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS
+from mjx_study.limits import MOST_PARAMS
 from mjx_study.options.option import MAX_VALUES, OptionError, Rows, check_span, declared, options_of, reject_untaken
 
 if TYPE_CHECKING:
@@ -123,7 +124,9 @@ class StudyConfig:
     estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = declared(
         ("zobg", "fobg", "aobg"), "NAME", "see `mjx-study estimators`", choices=ESTIMATORS, allows_user_code=True
     )
-    theta: tuple[float, ...] | None = declared(None, "X", "policy parameters", "(-inf, inf)", unset=UNSET_TASK)
+    theta: tuple[float, ...] | None = declared(
+        None, "X", "policy parameters", "(-inf, inf)", unset=UNSET_TASK, most=MOST_PARAMS
+    )
     network: tuple[int, ...] | None = declared(
         None, "N", "hidden widths of a tanh network that replaces the policy", "[1, 100000]", study="descents"
     )

@@ -100,6 +100,8 @@ def _policy_of(document: dict[str, Any]) -> dict[str, Any]:
     options = {name: value for name in POLICY_OPTIONS if (value := document.get(name)) is not None}
     if options.get("stiffness") == 0:  # no contact has one
         del options["stiffness"]
+    if isinstance(contact := options.get("contact"), str):
+        options["contact"] = contact.partition(", backward")[0]  # without the model of surrogate gradients
     for name, value in options.items():
         dataclasses.replace(OPTIONS[name], many=name in ("network", "disable_flag")).check(value)
     return options | {"task": task}

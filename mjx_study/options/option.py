@@ -66,6 +66,7 @@ class Option:
         read_rows: function that reads a list of lists of numbers from text, for an option that takes such lists.
         default: value of the field if it is not given.
         unset: default shown in the help if that is None.
+        most: maximum number of values.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Option:
     read_rows: Callable[[str], Rows] | None = None
     default: Any = None
     unset: str = ""
+    most: int = MAX_VALUES
 
     @property
     def flag(self) -> str:
@@ -140,8 +142,8 @@ class Option:
     def _listed(self, value: Any) -> Iterable[Any]:
         if not isinstance(value, tuple | list):
             raise ValueError(f"must be a list, got {short(value)}")
-        if len(value) > MAX_VALUES:
-            raise ValueError(f"takes at most {MAX_VALUES} values, got {len(value)}")
+        if len(value) > self.most:
+            raise ValueError(f"takes at most {self.most} values, got {len(value)}")
         return value
 
     def _check_one(self, value: Any) -> None:

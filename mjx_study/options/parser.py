@@ -32,6 +32,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, allow_abbrev=False, **settings)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # -2,2 and -1:1:5 are values too
 
     def error(self, message: str) -> NoReturn:
         message = re.sub(r"^argument (?!-)\S+: ", "", message)
