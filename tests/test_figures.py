@@ -176,6 +176,23 @@ def test_a_zero_is_marked_below_and_a_ratio_of_nothing_in_its_place() -> None:
     assert [x for x, _ in crosses(chart.axes[0])] == [1.5, 1.5]
 
 
+def test_a_bound_below_zero_is_not_taken_for_no_number() -> None:
+    """Squared biases are estimates that may be negative."""
+    models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
+    square = along("model", 1.0, -0.3, np.nan)
+    figure = plot_study(study("gradients", models, 3, squared_bias=square, squared_bias_se=0.1))["bias"]
+    assert sorted(above for _, above in crosses(figure.axes[0])) == [False] * 3 + [True] * 3
+
+
+def test_a_map_is_over_stiffness() -> None:
+    """And another parameter; two others make none."""
+    models = [("penalty", 10.0), ("penalty", 100.0)]
+    for chosen, drawn in ((models, {"map_stiffness_timestep_0.1", "map_stiffness_timestep_1"}), (models[:1], set())):
+        found = study("gradients", chosen, 3, (0.1, 1.0))
+        found = xr.concat([found, found.assign_coords(timestep=[2 * TIMESTEP])], "timestep")
+        assert {name for name in plot_study(found) if name.startswith("map")} == drawn
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, 1e138, 1e308])
 @pytest.mark.parametrize("kind", ["gradients", "descents", "landscapes"])

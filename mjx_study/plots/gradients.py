@@ -115,7 +115,7 @@ def bias(part: xr.Dataset, title: str) -> Figure | None:
             shown |= {"markerfacecolor": "none", "markersize": 7.5} if style["hollow"] else {"markersize": 4.5}
             axes.errorbar(at, y, yerr=bars, **shown, capsize=2.5, linestyle=joined)
             axes.plot(at[~seen], high[~seen], color=style["color"], marker="v", linestyle="none", alpha=0.45)
-            mark_undrawn(axes, at, np.where(np.isfinite(high), 1.0, np.nan), style)
+            mark_undrawn(axes, at, square + 1.96 * error, style)
         axes.plot([], [], color="0.5", marker="v", linestyle="none", alpha=0.6, label="no bias seen: upper bound")
         axes.axhline(1, color="0.7", linewidth=0.8, label=WHOLE)
         squares = part.assign(whole=xr.ones_like(part["squared_bias"]))

@@ -40,16 +40,18 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
 
 
 def drawings_of(dataset: xr.Dataset) -> dict[str, Drawing]:
-    """Figures of a study's kind, and a map of FoBG over ZoBG if two parameters are swept; none without numbers."""
+    """Figures of a study's kind, and a map of FoBG over ZoBG if stiffness and another parameter are swept; none without
+    numbers."""
     if not dataset.data_vars:
         return {}
     kind = kind_of(dataset)
     found = kind.drawings(dataset)
-    pair = [name for name in COORDINATES if len(np.unique(dataset[name].values)) > 1][:2]
-    if kind.compared and len(pair) == 2 and {"zobg", "fobg"} <= set(dataset["estimator"].values.tolist()):
-        draw = partial(_ratio_map, variable=kind.variables[kind.compared], quantity=kind.compared, other=pair[1])
-        caption = "First order against zeroth order over two swept parameters."
-        found[f"map_{pair[0]}_{pair[1]}"] = Drawing(draw, caption, keep=pair[1])
+    swept = [name for name in COORDINATES if len(np.unique(dataset[name].values)) > 1]
+    both = {"zobg", "fobg"} <= set(dataset["estimator"].values.tolist())
+    if kind.compared and both and len(swept) > 1 and swept[0] == "stiffness":
+        draw = partial(_ratio_map, variable=kind.variables[kind.compared], quantity=kind.compared, other=swept[1])
+        caption = "First order against zeroth order over stiffness and another swept parameter."
+        found[f"map_stiffness_{swept[1]}"] = Drawing(draw, caption, keep=swept[1])
     return found
 
 
@@ -99,7 +101,7 @@ def _ticks(values: np.ndarray) -> list[str]:
 
 
 def _ratio_map(part: xr.Dataset, title: str, variable: Variable, quantity: str, other: str) -> Figure | None:
-    """Plot log10 of FoBG over ZoBG against two swept parameters, one panel per family; blue where FoBG is smaller."""
+    """Plot log10 of FoBG over ZoBG against stiffness and `other`, one panel per family; blue where FoBG is smaller."""
     found = [(family, rows) for family, rows in families(part) if family] or families(part)
     ratios = []
     for _, rows in found:
