@@ -25,11 +25,11 @@ import numpy as np
 from mujoco import rollout
 
 from estimators import FirstOrder, ZerothOrder
-from estimators.noise import split_sample_key, standard_noise
 from mjx_study.compiled import Compiled
 from mjx_study.experiment.memory import check_memory
 from mjx_study.graph.native import native_summary
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
+from mjx_study.objective.cost import drawn
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment, local_devices
 from mjx_study.simulation._mjx import mjx
@@ -142,13 +142,13 @@ def check_bench(task: Task, samples: int, contact: ContactPoint | None = None) -
 
 
 def run_bench(
-    task: Task, samples: int, progress: Progress = silent, contact: ContactPoint | None = None
+    task: Task, samples: int, progress: Progress = silent, contact: ContactPoint | None = None, seed: int = 0
 ) -> BenchReport:
     """Measure everything, interleaved with the baselines, in a contact, by default that of a single run; report medians
     of repeats."""
     cell = single_contact(task)[0] if contact is None else contact
     devices = local_devices()
-    keys = jax.random.split(jax.random.key(0), samples)
+    keys = jax.random.split(jax.random.key(seed), samples)
     simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1], [task]))
     objective = simulator.objective(cell.contact)
     full = -(-samples // (simulator.chunk_size * len(devices))) * simulator.chunk_size * len(devices)
@@ -239,15 +239,13 @@ def stock_programs(
     """Programs for costs and gradients of the same samples through `mjx.step`, split into as many calls as there are
     devices, and made on those given."""
     scene, policy = task.scene, task.policy
-    dtype = scene.template.qpos.dtype
 
     def cost(theta, contact, key_data, iterations: int):
         model = scene.model.replace(opt=scene.model.opt.replace(iterations=iterations))
         model = apply_contact(model, contact)
         running_cost, final_cost = task.costs(contact)
-        start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
-        noise = task.sigma * standard_noise(noise_key, policy.noise_shape, dtype, task.noise)
-        start = policy.place(theta, noise, task.draw_start(start_key))
+        start, noise = drawn(task, jax.random.wrap_key_data(key_data), task.sigma, 1.0)
+        start = policy.place(theta, noise, start)
 
         def advance(data, feedforward):
             state = State(data.qpos, data.qvel, data.act, data.qacc_warmstart)

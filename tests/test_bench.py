@@ -9,7 +9,7 @@ import pytest
 
 from mjx_study import bench, cli
 from mjx_study.objective import Simulator, simulate
-from mjx_study.runtime import local_devices
+from mjx_study.runtime import environment, local_devices
 from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
@@ -26,14 +26,29 @@ RATIOS = {"gradient_per_value", "rollouts_over_stock", "rollouts_over_engine", "
     ],
 )
 def test_bench_prints_its_ratios_and_the_machine(
-    capsys: pytest.CaptureFixture[str], task: str, further: set[str]
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, task: str, further: set[str]
 ) -> None:
-    """Open loop, feedback from random starts, and a launch without contact by Runge-Kutta."""
-    assert cli.main(["bench", task, "--horizon", "3", "--samples", "6", "--json"]) == 0
+    """Open loop, feedback from random starts, and a launch without contact by Runge-Kutta; of the samples of a seed."""
+    keys, stock = [], bench.stock_programs
+    monkeypatch.setattr(bench, "stock_programs", lambda *given: keys.append(given[2]) or stock(*given))
+    assert cli.main(["bench", task, "--horizon", "3", "--samples", "6", "--seed", "3", "--json"]) == 0
+    expected = jax.random.key_data(jax.random.split(jax.random.key(3), 6))
+    np.testing.assert_array_equal(jax.random.key_data(keys[0]), expected)
     document = json.loads(capsys.readouterr().out)
     assert set(document["ratios"]) == RATIOS | further
     assert all(ratio > 0 for ratio in document["ratios"].values())
     assert document["environment"]["processor"] and document["gradient_memory"] > document["value_memory"] > 0
+
+
+def test_bench_warns_of_its_contact(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    report = bench.BenchReport("pusher", 6, 3, "penalty", dict.fromkeys(bench.TIMED, 1.0), 1.0, 1.0, environment())
+    report.environment["native"] = "none"
+    monkeypatch.setattr(bench, "run_bench", lambda *_: report)
+    stiff = ["bench", "pusher", "--samples", "6", "--contact", "penalty", "--stiffness", "1e6"]
+    assert cli.main(stiff) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+    assert cli.main([*stiff, "--json"]) == 0
+    assert [f"warning: {each}" for each in json.loads(capsys.readouterr().out)["warnings"]] == [line]
 
 
 @pytest.mark.slow

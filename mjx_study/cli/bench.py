@@ -8,8 +8,8 @@ from mjx_study.options.parser import MIDDLE, Parser
 
 EPILOG = """\
 Measures rollouts and gradients per second in a single run on this machine, and compares them with jax.grad through
-mjx.step (with one solver iteration, all that it can differentiate) and with the C engine's centred mjd_transitionFD
-and an adjoint, on the same number of threads.
+mjx.step (with one solver iteration, all that it can differentiate), on as many threads as are fastest, and with the C
+engine's centred mjd_transitionFD and an adjoint, measured on one thread and scaled as if threading were free.
 """
 
 
@@ -29,8 +29,9 @@ def run(options: argparse.Namespace) -> int:
         configure_process(options)
         task = task_of(options)
         given = options.contact, options.stiffness, options.damping, options.smoothing
-        contact, _ = single_contact(task, *given)
+        contact, messages = single_contact(task, *given)
         check_bench(task, options.samples, contact)
     with computing() as progress:
-        report = run_bench(task, options.samples, progress, contact)
-    return print_report(options, report.as_json(), report.lines())
+        report = run_bench(task, options.samples, progress, contact, options.seed or 0)
+    lines = [*report.lines(), *(f"warning: {message}" for message in messages)]
+    return print_report(options, report.as_json() | {"warnings": list(messages)}, lines)
