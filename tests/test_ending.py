@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,12 @@ import numpy as np
 import pytest
 
 from mjx_study import cli, disk
-from mjx_study.cli import studies
+from mjx_study.cli import output, studies
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.results.variables import GRADIENTS
 from tests.documents import content, stages_of, stub_cells
-from tests.processes import run_script
+from tests.processes import ROOT, run_script
 
 SIGNALS = """
 import os, signal, sys, time
@@ -87,6 +88,54 @@ def test_a_signal_ends_a_command_that_cannot_say_so(state: str, number: signal.S
         assert running.wait(timeout=4) == 128 + number
     if state != "gone":
         os.close(read)
+
+
+def test_a_command_with_a_folder_can_be_resumed_to_its_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also by what is computed once the study is written; without a folder nothing is."""
+    told: list[str] = []
+
+    def computing(interrupted: str = output.INTERRUPTED) -> Any:
+        told.append(interrupted)
+        return output.computing(interrupted)
+
+    monkeypatch.setattr(studies, "computing", computing)
+    study = "compare pusher --contact reference --stiffness 10 --horizon 2 --samples 4 --reference-samples 8".split()
+    for folder, expected in (([], output.INTERRUPTED), (["--output", str(tmp_path)], output.RESUMABLE)):
+        assert cli.main([*study, *folder]) == 0, capsys.readouterr().err
+        assert told == [expected] * 2
+        told.clear()
+
+
+FILM = """
+import numpy as np
+from mjx_study.cli import output
+from mjx_study.render import figures
+
+with output.computing():
+    figures._mp4(np.zeros((2, 4, 4, 3), np.uint8), np.array([500, 500]))
+"""
+FFMPEG = """#!/bin/sh
+trap 'touch "$0.ended"; exit 1' TERM
+kill -TERM $PPID
+for i in $(seq 50); do sleep 0.1; done
+"""
+
+
+def test_a_signal_ends_children_and_removes_their_folder(tmp_path: Path) -> None:
+    """Of ffmpeg, amid a film."""
+    (tmp_path / "kept").mkdir()
+    (ffmpeg := tmp_path / "ffmpeg").write_text(FFMPEG)
+    ffmpeg.chmod(0o755)
+    settings = os.environ | {"TMPDIR": str(tmp_path / "kept"), "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run([sys.executable, "-c", FILM], env=settings, cwd=ROOT, stderr=subprocess.DEVNULL)
+    assert done.returncode == 128 + signal.SIGTERM and not list((tmp_path / "kept").iterdir())
+    for _ in range(40):
+        if (tmp_path / "ffmpeg.ended").exists():
+            break
+        time.sleep(0.1)
+    assert (tmp_path / "ffmpeg.ended").exists()
 
 
 def test_names_of_folders_need_not_be_utf_8(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

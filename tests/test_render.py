@@ -1,6 +1,7 @@
 """Pictures of a motion: outlines against geometry, the right things in view, whole files, and clear refusals."""
 
 import stat
+import tracemalloc
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
@@ -325,6 +326,25 @@ def test_a_long_motion_has_a_bounded_number_of_frames() -> None:
     indices, lengths = frame_times(motion)
     assert len(indices) == 120 and indices[0] == 0 and indices[-1] == len(time) - 1
     assert lengths.sum() == pytest.approx(1000 * motion.duration + 500, abs=11)
+
+
+def test_times_are_the_nearest_ones_of_any_number() -> None:
+    """As found one by one, and of a million without an array of all distances."""
+    model = throw().model
+    time = np.cumsum(np.random.default_rng(0).uniform(0.01, 1, 500))
+    for times in (time, np.arange(41) / 4):
+        nearest = {int(np.argmin(np.abs(times - each))) for each in np.linspace(times[0], times[-1], 120)}
+        assert Motion(model, times, np.zeros((len(times), 3))).at(120).tolist() == sorted(nearest)
+    many = Motion(model, np.arange(1e6), np.zeros((1_000_000, 3)))
+    tracemalloc.start()
+    assert len(many.at(120)) == 120 and tracemalloc.get_traced_memory()[1] < 1e8
+    tracemalloc.stop()
+
+
+def test_a_frame_that_is_too_long_for_a_gif_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RenderError, match="a frame of a GIF lasts at most 655 s: lower slow, or use the format mp4"):
+        animate(throw(), tmp_path / "long.gif", slow=2e5)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_motion_of_one_state_is_a_film_of_one_frame(tmp_path: Path) -> None:

@@ -104,8 +104,17 @@ def _leave(message: str, code: int) -> NoReturn:
         if select.select([], [descriptor], [], 0)[1]:
             os.write(descriptor, f"{cursor}{message}\n".encode(errors="backslashreplace"))
     with suppress(Exception):
+        _end_children()
         remove_temporary_folders()
     os._exit(128 + code)
+
+
+def _end_children() -> None:
+    """End the processes that this one has started, such as a renderer or ffmpeg, where /proc lists them."""
+    for listed in Path("/proc/self/task").glob("*/children"):
+        for child in listed.read_text().split():
+            with suppress(ProcessLookupError):
+                os.kill(int(child), signal.SIGTERM)
 
 
 @contextmanager

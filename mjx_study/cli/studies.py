@@ -12,7 +12,7 @@ from typing import Any
 import xarray as xr
 
 from mjx_study.cli.options import configure_process, usage_errors
-from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
+from mjx_study.cli.output import INTERRUPTED, RESUMABLE, attempt, computing, print_report
 from mjx_study.diagnose.means import MeanCheck, check_terms, term_lines
 from mjx_study.execution.cluster import connected
 from mjx_study.execution.forecast import forecast_study
@@ -72,7 +72,7 @@ def run_one(
             written, failures = written + paths, [*failures, failure]
     checks: list[MeanCheck] = []
     if thetas:
-        with computing() as progress:
+        with computing(INTERRUPTED if folder is None else RESUMABLE) as progress:
             checks = check_terms(plan, thetas(document), progress)
     document |= {"means": [each.as_dict() for each in checks]} if checks else {}
     about = term_lines(checks, plan.config.onset)

@@ -4,7 +4,6 @@ import io
 import math
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -17,13 +16,14 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from mjx_study.choices import FILM_FORMATS, unknown
-from mjx_study.disk import write_whole
+from mjx_study.disk import temporary_folder, write_whole
 from mjx_study.render.drawing import Drawing
 from mjx_study.render.motion import Motion, resolve_view
 from mjx_study.render.opengl import RenderError, images
 
 MAX_FILM_FRAMES: Final = 120  # maximum number of frames in a film; longer ones have fewer per second
 FRAMES_PER_SECOND: Final = 25
+LONGEST_FRAME: Final = 655_350  # longest duration of a frame in the GIF format [ms]
 LAST_FRAME: Final = 0.5  # extra time for the last frame [s], so that a loop ends visibly
 MAX_GIF_BYTES: Final = 1_000_000  # size of a GIF above which its pictures are made smaller [bytes]
 _WIDTH: Final = 9.0  # of a strip [inches]
@@ -177,11 +177,14 @@ def animate(motion: Motion, path: Path, *, slow: float = 1.0, view: str = "auto"
 
     Raises:
         ValueError: unknown format, view or renderer, or invalid factor.
-        RenderError: the format or renderer does not work here.
+        RenderError: the format or renderer does not work here, or a frame lasts too long for the format.
     """
     kind = path.suffix.removeprefix(".").lower()
     check_format(kind)
     indices, lengths = frame_times(motion, slow)
+    if kind == "gif" and lengths.max() > LONGEST_FRAME:
+        seconds = LONGEST_FRAME // 1000
+        raise RenderError(f"a frame of a GIF lasts at most {seconds} s: lower slow, or use the format mp4")
     drawing = Drawing(motion, resolve_view(motion, view))
     rendered = images(drawing, indices, renderer)
     frames = _drawn(drawing, indices) if rendered is None else _labelled(drawing, indices, rendered)
@@ -255,7 +258,7 @@ def _mp4(frames: np.ndarray, lengths: np.ndarray) -> bytes:
     repeated = np.repeat(frames, np.maximum(np.round(lengths / np.median(lengths)).astype(int), 1), axis=0)
     rate = len(repeated) * 1000 / lengths.sum()
     height, width = 2 * (frames.shape[1] // 2), 2 * (frames.shape[2] // 2)
-    with tempfile.TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         path = Path(folder) / "film.mp4"
         command = ["ffmpeg", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
         command += ["-r", f"{rate:.6f}", "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path)]

@@ -127,7 +127,8 @@ class Motion:
     def at(self, count: int) -> Int[np.ndarray, " count"]:
         """Indices of `count` evenly spaced times from first to last, or of all if there are fewer."""
         wanted = np.linspace(self.time[0], self.time[-1], count)
-        return np.unique(np.argmin(np.abs(self.time[:, None] - wanted), axis=0))
+        nearest = np.ceil(np.interp(wanted, self.time, np.arange(len(self.time))) - 0.5)
+        return np.unique(nearest.astype(int))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,6 @@ import os
 import platform
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from mjx_study.choices import RENDERERS, unknown
+from mjx_study.disk import temporary_folder
 from mjx_study.render.drawing import Drawing, geom_colours
 from mjx_study.render.motion import depths
 
@@ -94,7 +94,7 @@ def _render(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
     model.vis.quality.shadowsize = min(int(model.vis.quality.shadowsize), _SHADOW)
     if model.nlight == 0:  # MuJoCo's headlight alone is dim
         model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.55, 0.45
-    with tempfile.TemporaryDirectory() as name:
+    with temporary_folder() as name:
         folder = Path(name)
         mujoco.mj_saveModel(model, str(folder / "model.mjb"), None)
         request: dict[str, Any] = {"qpos": motion.qpos[indices], "width": width, "height": height, "lookat": lookat}
