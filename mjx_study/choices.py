@@ -143,9 +143,14 @@ def is_file(name: str) -> bool:
     return name.lower().endswith(".xml")
 
 
+def registered_tasks() -> list[str]:
+    """Names of the tasks that installed packages register."""
+    return sorted({point.name for point in metadata.entry_points(group=TASK_GROUP)})
+
+
 def unknown_task(name: str, reason: str = "") -> str | None:
     """Return an error message for a task name that is unknown, or unusable for a reason; None if it may be valid."""
-    registered = sorted({point.name for point in metadata.entry_points(group=TASK_GROUP)})
+    registered = registered_tasks()
     if (name in TASK_DESCRIPTIONS or name in registered or ":" in name or is_file(name)) and not reason:
         return None
     module = Path(name.removesuffix(".py") + ".py")

@@ -21,7 +21,7 @@ LEAST: Final = 0.02
 """Share of a core that a computation uses at the least; drawing a progress bar takes half of that."""
 STANDSTILL: Final = (
     "the computation stands still: no processor time for {} s; "
-    "try again with --devices 1 or a smaller --chunk-size (existing files are complete)"
+    "try again with --devices 1 or, without native code, a smaller --chunk-size (existing files are complete)"
 )
 NAME: Final = "watchdog"
 _AWAITED: Final[list[int]] = []

@@ -271,3 +271,9 @@ def test_defaults(write) -> None:
         Task(
             **{name: getattr(task, name) for name in "name scene horizon policy theta sigma start contact_pair".split()}
         )
+
+
+def test_registered_tasks_are_listed(register, capsys: pytest.CaptureFixture[str]) -> None:
+    register(("hop", "a:hop"))
+    assert cli.main(["tasks"]) == 0
+    assert "hop                       registered by an installed package" in capsys.readouterr().out.splitlines()

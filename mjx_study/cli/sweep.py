@@ -40,7 +40,7 @@ A TOML file holds the same options under the names of their flags, with _ for -:
 
 
 def add(command: Parser) -> None:
-    choices = f"one or more of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
+    choices = f"one or more of: {', '.join(TASK_DESCRIPTIONS)}, module:name of your own, or an MJCF"
 
     def tasks(text: str) -> tuple[str, ...]:
         return tuple(map(known_task, OPTIONS["tasks"].parse(text)))

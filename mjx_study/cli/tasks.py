@@ -2,7 +2,7 @@
 
 import argparse
 
-from mjx_study.choices import TASK_DESCRIPTIONS
+from mjx_study.choices import TASK_DESCRIPTIONS, registered_tasks
 from mjx_study.cli.options import configure_process, usage_errors
 from mjx_study.cli.output import print_report
 from mjx_study.options.parser import Parser
@@ -15,14 +15,16 @@ def add(command: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    lines, rows = [f"{name:<25} {description}" for name, description in TASK_DESCRIPTIONS.items()], []
+    described = TASK_DESCRIPTIONS | dict.fromkeys(registered_tasks(), "registered by an installed package")
+    lines, rows = [f"{name:<25} {description}" for name, description in described.items()], []
     if options.json:
         from mjx_study.tasks import make_task
 
         with usage_errors():
             configure_process(options)
-        for task in map(make_task, TASK_DESCRIPTIONS):
+            tasks = {name: make_task(name) for name in described}
+        for name, task in tasks.items():
             mass = task.effective_mass if task.contact_pair else None
-            row = {"name": task.name, "params": task.policy.num_params, "horizon": task.horizon, "sigma": task.sigma}
+            row = {"name": name, "params": task.policy.num_params, "horizon": task.horizon, "sigma": task.sigma}
             rows.append(row | {"effective_mass": mass, "description": task.description})
     return print_report(options, {"tasks": rows}, lines)

@@ -217,7 +217,9 @@ class StudyConfig:
         None, "N", "iterations of the solver's line search", "[1, 100000]", unset=UNSET_MJCF
     )
     disable_flag: tuple[str, ...] | None = declared(None, "FLAG", "flags to disable, named as in the MJCF's <flag>")
-    chunk_size: int | None = declared(None, "N", "samples per device and call", "[1, 1e7]", unset="by the samples")
+    chunk_size: int | None = declared(
+        None, "N", "samples per device and call; native code has its own", "[1, 1e7]", unset="by the samples"
+    )
     block_size: int | None = declared(
         None, "N", "samples held at once", "[2, 1e7]", study="gradients", unset="all, if they fit"
     )

@@ -88,7 +88,7 @@ class StudyResults(ABC):
 
 
 def find_kind(name: str) -> Any:
-    """The kind of study of a name: a `StudyResults` for readers, a `mjx_study.experiment.kind.StudyKind` for plans."""
+    """The kind of study of a name: a `StudyResults` for readers, a `mjx_study.experiment.study.StudyKind` for plans."""
     return import_module(KINDS[name]).KIND
 
 
