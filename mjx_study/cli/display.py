@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
+from itertools import chain
 from operator import itemgetter
 from typing import Final
 
@@ -66,7 +67,7 @@ class Activity:
         """The outermost build of each thread with its time so far, and the number of libraries that are built."""
         from mjx_study.graph.build import libraries_pending
 
-        now, outermost = self._clock(), [each[0] for each in list(self._running.values()) if each]
+        now, outermost = self._clock(), list(chain(*(each[:1] for each in list(self._running.values()))))
         same = grouped((each for each in outermost if now - each[1] >= SHORT), itemgetter(0))
         found = [
             f"{what}{f' ({len(each)} at once)' if each[1:] else ''}, {now - min(since for _, since in each):.0f} s"
