@@ -126,6 +126,11 @@ class Estimator(ABC):
         return cls.name if ESTIMATORS.get(cls.name) is cls else f"{cls.__module__}:{cls.__qualname__}"
 
     @classmethod
+    def own_label(cls) -> str:
+        """Label that the class itself has; one that it inherits is of another estimator."""
+        return vars(cls).get("label", "")
+
+    @classmethod
     def required(cls) -> tuple[str, ...]:
         """Options without a default."""
         return tuple(field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING)

@@ -27,10 +27,13 @@ class Cautious(estimators.AlphaOrder):
 
 
 class Doubled(estimators.FirstOrder):
+    label = "Twice FoBG"
+
     def combine(self, differentiation):
         return estimators.summarise(2 * differentiation.gradient)
 """
-"""An interpolation, and one whose mean is wrong, under the name of the class that it inherits from."""
+"""An interpolation, and one whose mean is wrong, under the name of the class that it inherits from and a label of its
+own."""
 OWN, CAUTIOUS, DOUBLED = "my_estimators:SignAgreement", "my_estimators:Cautious", "my_estimators:Doubled"
 ANALYTIC = ["pusher", "--horizon", "4", "--contact", "reference", "--stiffness", "10,100"]
 STUDIES = {
@@ -144,7 +147,7 @@ def test_findings_report_its_bias(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["compare", *ANALYTIC, *arguments]) == 0
     found = json.loads(capsys.readouterr().out)["findings"]
     (told,) = (sentence for sentence in found if "mean is" in sentence)
-    assert told.startswith("reference: Doubled's mean is biased by") and re.search(r"\b10\b.*\b100 N/m", told)
+    assert told.startswith("reference: Twice FoBG's mean is biased by") and re.search(r"\b10\b.*\b100 N/m", told)
     shares = re.findall(r"([\d.]+) ± ([\d.]+) %", told)
     assert shares
     for share, error in shares:
@@ -159,11 +162,23 @@ def test_gradcheck_takes_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert (right["estimator"], right["verdict"]) == ("fobg", "right")
     assert (wrong["estimator"], wrong["verdict"]) == (DOUBLED, "biased")
     assert abs(wrong["relative_gap"]) == pytest.approx(1.0, abs=0.1)
-    assert cli.main([*common, "--estimators", OWN, "--direction", "means"]) in (0, 3)
+    assert cli.main([*common, "--estimators", f"{OWN},{DOUBLED}", "--direction", "means"]) == 1
     setting, noise, path, _, *table = capsys.readouterr().out.splitlines()
     assert setting == "tests.carts:walled_cart: 1000 samples at each node of the path, seed 0, float64"
     assert noise.startswith("gaussian noise of sigma = ") and "about theta, direction means" in path
-    assert any(re.match(r" *penalty +10 +SignAgreement ", line) for line in table)
+    for label in ("SignAgreement", "Twice FoBG"):
+        assert any(re.match(rf" *penalty +10 +{label} ", line) for line in table)
+
+
+def test_tables_have_its_label(capsys: pytest.CaptureFixture[str]) -> None:
+    few = ["--horizon", "4", "--samples", "4", "--estimators", f"{OWN},{DOUBLED}"]
+    for command in (
+        ["compare", "pusher", "--contact", "reference", "--stiffness", "10", "--reference-samples", "8"],
+        ["optimise", "pusher", "--reference", "--iterations", "1", "--learning-rate", "0.01"],
+    ):
+        assert cli.main([*command, *few]) == 0
+        table = capsys.readouterr().out
+        assert "SignAgreement  " in table and "Twice FoBG  " in table and "Doubled" not in table
 
 
 def test_examples_of_estimators_with_required_options_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:

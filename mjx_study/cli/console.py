@@ -13,13 +13,12 @@ import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from estimators.registry import label_of
 from mjx_study.choices import FAMILIES, REFERENCE, is_file
 from mjx_study.experiment.iteration import REASONS
 from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS
 from mjx_study.results.curves import curves_of, line_of
 from mjx_study.results.kind import findings_of
-from mjx_study.results.rows import Row, numbers_of, onset_of, remains, rows_of
+from mjx_study.results.rows import Row, label_in, numbers_of, remains, rows_of
 from mjx_study.results.variables import (
     COLUMNS,
     COORDINATES,
@@ -54,7 +53,7 @@ def _doubt(row: Row) -> str:
     return "" if row.believable else "?"
 
 
-def columns(confidence: float, onset: str, *, details: bool, scalar: bool) -> list[list[Column]]:
+def columns(confidence: float, label: Callable[[str], str], *, details: bool, scalar: bool) -> list[list[Column]]:
     """Columns of the comparison: those that identify a row, then groups that a table keeps together; a scalar parameter
     has no cosine."""
     quantities = GRADIENTS | COORDINATES | DERIVED
@@ -77,7 +76,7 @@ def columns(confidence: float, onset: str, *, details: bool, scalar: bool) -> li
         more, show = own.get(name, ("", lambda row: variable.text(getattr(row, name))))
         return variable.heading + more, show
 
-    identity = [column("stiffness"), ("estimator", lambda row: label_of(row.estimator, onset))]
+    identity = [column("stiffness"), ("estimator", lambda row: label(row.estimator))]
     hidden = () if details and not scalar else ("cosine",) if details else DETAILS
     return [identity, *([column(name) for name in group if name not in hidden] for group in COLUMNS)]
 
@@ -113,7 +112,8 @@ def _chosen(config: dict[str, Any]) -> str:
 
 def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool = False) -> list[str]:
     config, rows, lines = document["config"], rows_of(dataset), []
-    shown = columns(config["confidence"], onset_of(dataset), details=details, scalar=dataset.sizes.get("param") == 1)
+    label = partial(label_in, dataset)
+    shown = columns(config["confidence"], label, details=details, scalar=dataset.sizes.get("param") == 1)
     for resolved, task in zip(document["resolved"], dataset["task"].values.tolist(), strict=True):
         lines.append(
             f"{task}: {', '.join(map(str, config['samples']))} samples in each batch, "
@@ -221,7 +221,7 @@ def _run(one: xr.Dataset) -> dict[str, Any]:
 
 
 def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
-    config, onset = document["config"], onset_of(dataset)
+    config, label = document["config"], partial(label_in, dataset)
     where = "analytic reference" if config["contact"] == REFERENCE else config["contact"]
     if config["stiffness"]:
         where = f"{where}, K = {config['stiffness']:g} N/m"
@@ -238,15 +238,15 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         f"{config['samples']} samples in each batch, {seeds}, "
         f"sigma {config['sigma']:g}; {start.heading} {with_error(mean, error, start.digits)}{metrics}",
         "",
-        *format_table([_row(run, onset, costs) for run in document["runs"]], headings),
+        *format_table([_row(run, label(run["estimator"]), costs) for run in document["runs"]], headings),
     ]
     at_once = min(len(document["runs"]), len(document["environment"]["devices"]))
     if at_once > 1:
         lines.append(f"seconds: of wall clock, without compilation, while {at_once} estimators compute side by side.")
     for run in document["runs"]:
         for stop in run["stopped"]:
-            label = label_of(run["estimator"], onset)
-            lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
+            who = f"{label(run['estimator'])}, seed {stop['seed']}"
+            lines.append(f"{who}: stopped at iteration {stop['iteration']}, {stop['reason']}")
     if (paths := document.get("policies")) and not is_file(config["task"]):  # rollout moves a file as its MJCF says
         least = [np.nanmin(_finite(run["final_cost"]), initial=np.inf) for run in document["runs"]]
         best = shlex.join(["mjx-study", "rollout", config["task"], "--theta", paths[int(np.argmin(least))]])
@@ -254,12 +254,12 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
-def _row(run: dict[str, Any], onset: str, num_costs: int) -> list[str]:
+def _row(run: dict[str, Any], label: str, num_costs: int) -> list[str]:
     digits, costs = DESCENTS["final_cost"].digits, _finite(run["final_cost"])
     length = len(run["seconds"])
     weights = _finite([weight for row in run["history"]["alpha"][-max(1, length // 10) :] for weight in row])
     return [
-        label_of(run["estimator"], onset),
+        label,
         *(_with_spread(np.mean, costs, digits), _with_spread(np.min, costs, digits).partition(" ")[0])[:num_costs],
         *(_with_spread(np.mean, _finite(values), 3) for values in run["metrics"].values()),
         DESCENTS["alpha"].text(float(np.mean(weights))) if len(weights) else "-",

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.mean_check import NODES, TOLERANCE, Circulation, circulations
-from estimators.registry import label_of
+from estimators.registry import find_estimator, label_of
 from mjx_study.diagnose.columns import MEANS
 from mjx_study.experiment.resolution import CORRECTED, check_estimators, direction_of, reads_onset
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches
@@ -237,7 +237,7 @@ def check_terms(
 def term_lines(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
     lines = []
     for check in checks:
-        row, name = check.as_dict(), label_of(check.estimator, onset)
+        row, name = check.as_dict(), _label(check.estimator, onset)
         where = f"{check.contact}, K = {check.stiffness:g} N/m" if check.stiffness else check.contact
         more = "; more --samples decide it" if check.verdict == "undecided" else ""
         gap, half = row["relative_gap"], (row["detectable"] or 0.0) / 2
@@ -251,10 +251,15 @@ def term_lines(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
     return lines
 
 
+def _label(name: str, onset: str) -> str:
+    """Label of an estimator that has been checked, so that its module is known."""
+    return (":" in name and find_estimator(name).own_label()) or label_of(name, onset)
+
+
 def lines_of(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
     identity = (
         Column("contact", itemgetter("contact")),
         Column("K [N/m]", lambda row: f"{row['stiffness']:g}" if row["stiffness"] else "-"),
-        Column("estimator", lambda row: label_of(row["estimator"], onset)),
+        Column("estimator", lambda row: _label(row["estimator"], onset)),
     )
     return tabulate([check.as_dict() for check in checks], [*identity, *MEANS])

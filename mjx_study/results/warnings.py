@@ -7,8 +7,7 @@ import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from estimators.registry import label_of
-from mjx_study.results.rows import onset_of
+from mjx_study.results.rows import label_in, model_name
 
 MOST_NAMED: Final = 3  # maximum number of contact models that a warning names
 EXPLODED: Final = 1e30
@@ -21,12 +20,12 @@ def lost_samples(dataset: xr.Dataset) -> list[str]:
     counts, messages = dataset.get("nonfinite"), []
     if counts is not None and (by_model := _per_model(counts, "sum")).max() > 0:
         estimators = counts.sum([name for name in counts.dims if name not in ("model", "estimator")])
-        labels = [label_of(name, onset_of(dataset)) for name in dataset["estimator"].values.tolist()]
+        labels = [label_in(dataset, name) for name in dataset["estimator"].values.tolist()]
         told = []
         for index in np.argsort(-by_model, kind="stable")[: min(MOST_NAMED, np.count_nonzero(by_model))].tolist():
             each = estimators.isel(model=index).values.astype(int).tolist()
             shares = ", ".join(f"{label} {count}" for label, count in zip(labels, each, strict=True) if count)
-            told.append(f"{_name(dataset, index)} ({shares})")
+            told.append(f"{model_name(dataset.isel(model=index))} ({shares})")
         more = np.count_nonzero(by_model) - len(told)
         told += [f"{more} more contact models"] if more else []
         messages.append(
@@ -35,8 +34,9 @@ def lost_samples(dataset: xr.Dataset) -> list[str]:
         )
     largest = np.max([_per_model(dataset[name], "max") for name in SIZES if name in dataset], axis=0, initial=0.0)
     for index in np.flatnonzero(largest > EXPLODED)[:MOST_NAMED].tolist():
+        name = model_name(dataset.isel(model=index))
         messages.append(
-            f"{_name(dataset, index)}: the motion explodes (numbers up to {largest[index]:.0e}), as where the step in "
+            f"{name}: the motion explodes (numbers up to {largest[index]:.0e}), as where the step in "
             "contact is unstable; use a smaller --timestep, or softer contact"
         )
     return messages
@@ -52,11 +52,6 @@ def _per_model(values: xr.DataArray, how: str) -> np.ndarray:
     """Sum or maximum of finite values for each contact model."""
     finite = values.where(np.isfinite(values))
     return getattr(finite, how)([name for name in values.dims if name != "model"]).fillna(0).values
-
-
-def _name(dataset: xr.Dataset, index: int) -> str:
-    stiffness = float(dataset["stiffness"][index])
-    return f"{dataset['contact'].values[index]}" + (f", K = {stiffness:g} N/m" if stiffness > 0 else "")
 
 
 def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:

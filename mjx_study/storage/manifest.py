@@ -159,7 +159,7 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         axes[name].sort()
     index = {name: {value: place for place, value in enumerate(along)} for name, along in axes.items()}
     places = [{name: index[name][value] for name, value in each.items()} for each in exact]
-    named = zip(plan.config.estimator_names, plan.config.estimators, strict=True)
+    named = zip(plan.config.estimator_names, map(find_estimator, plan.config.estimators), strict=True)
     return {
         "config": plan.fields,
         "warnings": list(plan.warnings),
@@ -171,7 +171,7 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         "command": command,
         # what figures and reports need of an estimator, so that reading a study imports none
         "described": {
-            name: {"label": label_of(name), "needs": list(find_estimator(each).needs)} for name, each in named
+            name: {"label": found.own_label() or label_of(name), "needs": list(found.needs)} for name, found in named
         },
         "models": [{"contact": family, "stiffness": stiffness} for family, stiffness in axes["model"]],
         "axes": axes | {"task": _task_names(plan, axes["task"]), "model": _model_names(axes["model"])},
