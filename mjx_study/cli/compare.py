@@ -6,7 +6,7 @@ from functools import partial
 from estimators.registry import ESTIMATORS
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import study_fields
-from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.parser import Parser
 from mjx_study.results.variables import COLUMNS, DETAILS, GRADIENTS, MARKS, explained
 from mjx_study.table import described
@@ -36,9 +36,7 @@ and with --details:
 
 
 def add(command: Parser) -> None:
-    command.add_task_argument()
-    command.add_options("sigma", "timestep", "cone", *BUILDER_OPTIONS)
-    command.add_process_options()
+    command.add_task_options(many=True)
     command.add_contact_options()
     command.add_theta_option("parameters at which gradients are taken")
     command.add_options("estimators", "reference_samples")

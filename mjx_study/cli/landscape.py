@@ -28,15 +28,13 @@ quadrature over 1500 rollouts and gradients per contact model (more if --noise h
 
 
 def add(command: Parser) -> None:
-    command.add_task_argument()
-    command.add_options("sigma", "timestep", "cone", *BUILDER_OPTIONS, "noise")
-    command.add_process_options()
+    command.add_task_options(many=True)
     command.add_contact_options(MIDDLE)
     command.add_theta_option("parameters that the line goes through")
     command.add_option("estimators", default=("zobg", "fobg"))
     command.add_option("samples", default=(100,))
     command.add_option("points", default=41)
-    command.add_options("span", "direction", "gamma", *REQUIRED_OPTIONS, "onset", "chunk_size")
+    command.add_options("span", "direction", "noise", "gamma", *REQUIRED_OPTIONS, "onset", "chunk_size")
     command.add_backward_options()
     command.add_flag("--no-reference", "omit the analytic reference")
     command.add_folder_options()

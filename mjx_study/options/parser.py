@@ -91,21 +91,22 @@ class Parser(argparse.ArgumentParser):
             help=option.describe().replace("%", "%%"),
         )
 
-    def add_task_options(self) -> None:
-        """Add the task, options that override its settings, and process options, for a command without a study."""
+    def add_task_options(self, *, many: bool = False) -> None:
+        """Add the task, options that override its settings, one value or many, and process options."""
         self.add_task_argument()
-        self.add_option("sigma", many=False)
-        self.add_builder_options()
+        self.add_option("sigma", many=many)
+        self.add_builder_options(many=many)
         self.add_process_options()
 
     def add_task_argument(self) -> None:
         named = f"one of: {', '.join(TASK_DESCRIPTIONS)}; module:name of your own; or any MJCF that MJX runs"
         self.add_argument("task", type=known_task, metavar="TASK|FILE.xml", help=named)
 
-    def add_builder_options(self, **changes: dict[str, Any]) -> None:
+    def add_builder_options(self, *, many: bool = False, **changes: dict[str, Any]) -> None:
         """Add options for the builder of a task, with changes to their declarations."""
         for name in TASK_OPTIONS:
-            self.add_option(name, many=name == "disable_flag", **changes.get(name, {}))
+            several = name == "disable_flag" or (many and OPTIONS[name].many)
+            self.add_option(name, many=several, **changes.get(name, {}))
 
     def add_theta_option(self, purpose: str) -> None:
         """Add `--theta`, which may name a file."""
