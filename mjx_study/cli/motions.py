@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,26 +37,51 @@ OF_TASKS: Final = ("contact", "stiffness", "damping", "smoothing", "noisy", "sig
 MOST_BODIES_LISTED: Final = 12  # maximum number of bodies, and of joints, whose final positions are printed
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Rollout:
     """A simulated rollout, with one control fewer than states.
 
     Attributes:
-        time: of each state [s].
-        facts: what is known about the rollout, as JSON data.
+        source: what was simulated and at what cost, as JSON data.
         focus: geoms to keep in view.
-        lasting: number of states before the first nonfinite one.
     """
 
     title: str
     model: mujoco.MjModel
-    time: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
     controls: np.ndarray
-    facts: dict[str, Any]
-    focus: tuple[int, ...]
-    lasting: int
+    source: dict[str, Any]
+    focus: tuple[int, ...] = ()
+
+    @cached_property
+    def time(self) -> np.ndarray:
+        """Time of each state [s]."""
+        return np.arange(len(self.qpos)) * self.model.opt.timestep
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The states before the first nonfinite one; UsageError if there are none."""
+        good = np.all(np.abs(np.concatenate([self.qpos, self.qvel], axis=1)) < LARGEST_COORDINATE, axis=1)
+        lasting = len(good) if good.all() else int(np.argmin(good))
+        if lasting == 0:
+            raise UsageError(f"{self.title}: the first state is not finite")
+        return Motion(self.model, self.time[:lasting], self.qpos[:lasting], self.focus)
+
+    @cached_property
+    def facts(self) -> dict[str, Any]:
+        """The source with steps, duration [s], the last finite joint coordinates, and where bodies are then, by their
+        centres of mass [m]."""
+        model, motion, steps = self.model, self.motion, len(self.controls)
+        joints = [name for name, _ in coordinates(model)]
+        bodies = {model.body(body).name or f"body {body}": body for body in np.flatnonzero(motion.moving)}
+        return self.source | {
+            "steps": steps,
+            "duration": steps * model.opt.timestep,
+            "finite": len(motion.time) > steps,
+            "qpos": dict(zip(joints, motion.qpos[-1].tolist(), strict=True)),
+            "bodies": {name: motion.poses.centre[-1, body].tolist() for name, body in bodies.items()},
+        }
 
 
 def run_rollout(options: argparse.Namespace) -> int:
@@ -77,8 +102,8 @@ def run_rollout(options: argparse.Namespace) -> int:
         rollout = simulate()
         progress(1, 2, "drawing")
         written, unwritten = attempt(lambda: _write(rollout, folder, options))
-    if rollout.lasting < len(rollout.qpos):
-        messages += (f"the state is not finite from {rollout.time[rollout.lasting]:g} s on; pictures end before",)
+    if (lasting := len(rollout.motion.time)) < len(rollout.time):
+        messages += (f"the state is not finite from {rollout.time[lasting]:g} s on; pictures end before",)
     document = rollout.facts | {"warnings": list(messages), "written": [str(path) for path in written]}
     return print_report(options, document, _lines(rollout, messages, written), unwritten)
 
@@ -123,7 +148,7 @@ def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Ro
     program = objective.compiled_rollout(task)
     outputs = program(theta, cell.contact, jax.random.key(seed), jnp.asarray(float(noisy), theta.dtype))
     states, controls, cost, residual = jax.device_get(outputs)
-    facts = {
+    source = {
         "task": task.name,
         "contact": cell.family,
         "stiffness": cell.stiffness_or_zero,
@@ -137,7 +162,8 @@ def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Ro
     at = f"theta {float(theta[0]):g}, " if theta.size == 1 else ""
     title = f"{task.name}: {cell.label}, {at}{noise}"
     focus = tuple(task.scene.geom(name) for name in task.contact_pair or ())
-    return _rollout(title, task.scene.host, states.qpos, states.qvel, controls, facts, focus)
+    qpos, qvel = np.asarray(states.qpos, float), np.asarray(states.qvel, float)
+    return Rollout(title, task.scene.host, qpos, qvel, np.asarray(controls), source, focus)
 
 
 def _simulate_passive(model: mujoco.MjModel, name: str, steps: int) -> Rollout:
@@ -152,44 +178,12 @@ def _simulate_passive(model: mujoco.MjModel, name: str, steps: int) -> Rollout:
         mujoco.mj_step(model, data)
         qpos[index + 1], qvel[index + 1] = data.qpos, data.qvel
     controls = np.tile(data.ctrl, (steps, 1))
-    return _rollout(f"{name}: C engine", model, qpos, qvel, controls, {"task": name})
-
-
-def _rollout(
-    title: str,
-    model: mujoco.MjModel,
-    qpos: np.ndarray,
-    qvel: np.ndarray,
-    controls: np.ndarray,
-    facts: dict[str, Any],
-    focus: tuple[int, ...] = (),
-) -> Rollout:
-    """Build a rollout with the common facts: steps, duration, final joint coordinates, and where bodies end, by their
-    centres of mass."""
-    qpos, qvel, controls = np.asarray(qpos, float), np.asarray(qvel, float), np.asarray(controls)
-    good = np.all(np.abs(np.concatenate([qpos, qvel], axis=1)) < LARGEST_COORDINATE, axis=1)
-    steps, lasting = len(qpos) - 1, len(good) if good.all() else int(np.argmin(good))
-    duration = steps * model.opt.timestep
-    facts |= {"steps": steps, "duration": duration, "finite": lasting == len(good), "qpos": {}, "bodies": {}}
-    if lasting > 0:
-        names = [name for name, _ in coordinates(model)]
-        facts["qpos"] = dict(zip(names, qpos[lasting - 1].tolist(), strict=True))
-        data = mujoco.MjData(model)
-        data.qpos[:] = qpos[lasting - 1]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        for body in np.flatnonzero(model.body_weldid):
-            facts["bodies"][model.body(body).name or f"body {body}"] = data.xipos[body].tolist()
-    time = np.arange(len(qpos)) * model.opt.timestep
-    return Rollout(title, model, time, qpos, qvel, controls, facts, focus, lasting)
+    return Rollout(f"{name}: C engine", model, qpos, qvel, controls, {"task": name})
 
 
 def _write(rollout: Rollout, folder: Path, options: argparse.Namespace) -> list[Path]:
     """Write all files of a rollout; what can fail comes first, so that a failure leaves nothing."""
-    if rollout.lasting == 0:
-        raise UsageError(f"{rollout.title}: the first state is not finite")
-    motion = Motion(rollout.model, rollout.time[: rollout.lasting], rollout.qpos[: rollout.lasting], rollout.focus)
-    view, renderer = options.view, options.renderer
+    motion, view, renderer = rollout.motion, options.view, options.renderer
     try:
         pictures = strip(motion, frames=options.frames, view=view, renderer=renderer)
         ghosts = stroboscope(motion, view=view)
