@@ -25,7 +25,7 @@ MOST_DECADES: Final = 6  # maximum ratio of FoBG to ZoBG, or of ZoBG to FoBG, th
 
 
 def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
-    """Plot every figure that a study has data for, by file name without suffix."""
+    """Plot the figures that a study has data for, at most `MAX_FIGURES` of a kind, by file name without suffix."""
     figures: dict[str, Figure] = {}
     drawings, computed = drawings_of(dataset), kind_of(dataset).computed
     finite = dataset.map(drawable, keep_attrs=True).assign({computed: dataset[computed]} if drawings else {})

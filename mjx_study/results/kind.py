@@ -40,7 +40,7 @@ class StudyResults(ABC):
         variables: variables of a cell.
         optional: variables that a cell may lack.
         columns: quantities in the table of a report.
-        compared: variable whose ratio between two estimators is mapped over two swept parameters; None for no map.
+        compared: variable whose ratio of two estimators is mapped over stiffness and another parameter; None for none.
         computed: variable that is finite in every computed cell.
         finite: variable that has a finite number unless all samples are lost.
     """
