@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 import estimators
 from estimators import bernstein_epsilon
@@ -35,7 +35,9 @@ def test_the_rigorous_formula():
     radius, logarithm = 7.0, np.log(3 / 0.05)
     share = np.mean([25.0, 5.0]) / 2 / (2 * radius**2)
     divergence = lambda q: share * np.log(share / q) + (1 - share) * np.log((1 - share) / (1 - q))  # noqa: E731
-    variance = 2 * radius**2 * brentq(lambda q: 2 * divergence(q) - np.log(1 / 0.05), share, 1 - 1e-12, xtol=1e-14)
+    bracket = share, 1 - 1e-12
+    found = root_scalar(lambda q: 2 * divergence(q) - np.log(1 / 0.05), bracket=bracket, method="brentq", xtol=1e-14)
+    variance = 2 * radius**2 * found.root
     epsilon = bernstein_epsilon(
         summarise(jnp.asarray(ROWS)), failure_probability=0.1, variance_proxy="upper_bound", radius=radius
     )

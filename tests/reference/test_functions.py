@@ -1,6 +1,7 @@
 """The scalar functions: their gradients, jumps and smoothing, and the ball against its trajectory."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from tests.reference.functions import FUNCTIONS, FunctionCase, Square
 from tests.reference.systems import differentiate
 
 ANGLES = np.linspace(-np.pi, np.pi, 4001)
-BARE = SimpleNamespace(num_params=1, value=lambda x: x[..., 0], gradient=np.ones_like)
+BARE: Any = SimpleNamespace(num_params=1, value=lambda x: x[..., 0], gradient=np.ones_like)
 scalar = pytest.mark.parametrize("case", FUNCTIONS.values(), ids=FUNCTIONS.keys())
 
 
