@@ -196,7 +196,10 @@ class Digest:
             finite = np.isfinite(array)
             mantissa, exponent = np.frexp(np.where(finite, array, 0).astype(float))
             kind = np.where(finite, 0, np.where(np.isnan(array), 1, np.where(array > 0, 2, 3)))
-            self._sha.update(np.rint(np.ldexp(mantissa, 40)).astype(np.int64).tobytes())
+            rounded = np.rint(np.ldexp(mantissa, 40))
+            carried = np.abs(rounded) == 2.0**40  # up to a power of two, whose mantissa is 0.5
+            rounded, exponent = np.where(carried, rounded / 2, rounded), exponent + carried
+            self._sha.update(rounded.astype(np.int64).tobytes())
             array = np.stack([exponent.astype(np.int32), kind.astype(np.int32)])
         if array.dtype.kind == "O":
             self._all("objects", array.ravel().tolist())
@@ -214,7 +217,7 @@ class Digest:
         for field in dataclasses.fields(on_device):
             theirs, ours = getattr(scene.host, field.name, None), getattr(on_device, field.name, None)
             if isinstance(theirs, np.ndarray) and isinstance(ours, np.ndarray | jax.Array) and theirs.size == ours.size:
-                if not np.allclose(theirs.ravel(), np.ravel(ours), rtol=1e-6, equal_nan=True):
+                if not np.allclose(theirs.ravel(), np.ravel(ours), rtol=1e-6, atol=0, equal_nan=True):
                     self._all(f"mjx.{field.name}", (ours,))
 
     def _model(self, model: mujoco.MjModel) -> None:
@@ -227,12 +230,13 @@ class Digest:
                     self._all(part + name, (np.asarray(value),))
 
     def _function(self, function: types.FunctionType) -> None:
-        if by_version(function.__module__):
+        module = function.__module__ or ""  # none if made by exec in a namespace without a name
+        if by_version(module):
             function = inspect.unwrap(function)
-        home = function.__globals__.get("__name__", function.__module__)  # decorators copy __module__
-        self._note("function", FORMER.get(function.__module__, function.__module__), function.__qualname__)
+        home = function.__globals__.get("__name__", module)  # decorators copy __module__
+        self._note("function", FORMER.get(module, module), function.__qualname__)
         self._all("holds", (function.__defaults__, function.__kwdefaults__, _closure(function), _state(function)))
-        if by_version(home) or by_version(function.__module__):
+        if by_version(home) or by_version(module):
             return
         self.sources.add(home)
         code, path = function.__code__, source_file(home)
