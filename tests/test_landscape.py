@@ -67,6 +67,12 @@ def test_quadrature_against_closed_forms(function, tolerance: float, noise: str)
     assert np.all(np.abs(found.slope - slope) <= 10 * found.slope_error + 1e-4 * scale)
 
 
+def test_narrow_noise_has_no_quadrature() -> None:
+    """Rather than none of what is sampled."""
+    plan = plan_study(config("momentum_transfer", contact=("mujoco_default",), sigma=(1e-3,), horizon=20, points=2))
+    assert landscapes.LandscapeComputation(plan)._exact(plan.cells[0], np.array([-1.0, 1.0]), None) is None
+
+
 def test_quadrature_refuses_grids_that_cannot_serve() -> None:
     for low, high, size, noise, says in (
         (0.0, 1.0, 100, "gaussian", "5.3 sigma"),  # too coarse

@@ -1,17 +1,19 @@
 """Runs that could say nothing: refused before anything is compiled, or ended with the reason; samples lost by place."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import xarray as xr
 
 from mjx_study import cli
 from mjx_study.bench import check_bench
 from mjx_study.diagnose.run import diagnose_task
-from mjx_study.execution.lost import first_nonfinite
+from mjx_study.execution.lost import all_lost, first_nonfinite
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import lost_samples
@@ -100,6 +102,20 @@ def test_a_run_that_loses_all_samples_ends_with_the_reason(capsys: pytest.Captur
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith(f"mjx-study: all samples are lost: {__name__}:lost, mjcf")
     assert last.endswith("the final_cost is -inf after step 20, where the state is finite")
+
+
+def test_where_nothing_was_computed_or_descents_diverge_no_sample_is_blamed() -> None:
+    (unwritten, descents), nan = (
+        (
+            plan_study(StudyConfig(tasks=("ball_wall",), contact=("reference",), kind=kind))
+            for kind in ("gradients", "descents")
+        ),
+        ("seed", [np.nan]),
+    )
+    assert all_lost(unwritten, xr.Dataset()) is None
+    diverged = xr.Dataset({"final_cost": nan, "start_cost": 2.0})
+    assert str(all_lost(descents, diverged)).endswith("although that at the start is: use a lower --learning-rate")
+    assert str(all_lost(descents, diverged.assign(start_cost=np.nan))).startswith("all samples are lost")
 
 
 def test_the_first_nonfinite_quantity_has_a_name() -> None:

@@ -20,6 +20,7 @@ from mjx_study.execution.run import run_study
 from mjx_study.experiment import tally
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import StudyError, estimators_of
+from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import BlankObjective, MjxObjective
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.panels import limit
@@ -206,6 +207,7 @@ FINDINGS: dict[str, tuple[list[dict[str, Any]], list[str]]] = {
     ),
     "bound above the radius": ([row("aobg", 10, 1.0, alpha=0.3, epsilon=7.0, discrepancy=1.0)], []),
     "soft onsets": (term(), []),
+    "onsets without a term": (term(onset_spread=math.nan, onset_strength=math.nan), []),
     "narrow noise": (term(onset_spread=0.4), ["may be off .*noise is narrow"]),
     "narrow noise, strong onsets": (term(onset_spread=0.4, onset_strength=0.25), ["may be off .*noise is narrow"]),
     "strong onsets": (term(onset_strength=0.25), ["can be off by 12 % of what it adds"]),
@@ -230,6 +232,14 @@ def test_verdicts_on_a_bias() -> None:
     assert [rows_of(result(*each))[0].bias_verdict for each in made_up] == ["none seen", "biased", few, few]
     doubtful = result(row("fobg", 10, 1, **LOUD, reference_effective_samples=2.0))
     assert as_json(doubtful)["rows"][0]["bias_verdict"] == few
+
+
+def test_onsets_without_a_term_are_counted_and_say_nothing_else() -> None:
+    """Missed as all of a rollout's may be, which then has neither a first step nor a strength."""
+    begun, missed, none = [1, 1, 0, 0.3, 50, 0], [3, 0, 3, 0, math.nan, 0], [0, 0, 0, 0, math.nan, 0]
+    whole = onset_numbers(np.array([begun, missed, begun[:4] + [60, 0], none], float))
+    np.testing.assert_allclose(whole, [5, 2, 3, 0.3, 5, 0], rtol=1e-15)
+    np.testing.assert_array_equal(onset_numbers(np.array([missed, none], float)), [3, 0, 3, math.nan, math.nan, 0])
 
 
 def joined(dimension: str, values: list[Any], parts: list[xr.Dataset]) -> xr.Dataset:

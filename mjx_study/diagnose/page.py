@@ -114,8 +114,10 @@ def _contact_lines(found: Diagnosis) -> list[str]:
         before = f" a contact begins {1e3 * found.lead:.3g} ms before touch, where it acts;" if found.lead else ""
         lines.insert(0, f"  {found.law} is not MuJoCo's law:{before} onset terms and impedance do not apply")
     if onsets:
-        lines.append(f"  step at which the first begins: standard deviation {found.onsets['onset_spread']:.2g}")
-        if "onset_strength" in found.onsets:
+        begun = math.isfinite(found.onsets["onset_spread"])
+        if begun:
+            lines.append(f"  step at which the first begins: standard deviation {found.onsets['onset_spread']:.2g}")
+        if begun and "onset_strength" in found.onsets:
             share = percent(found.onsets["onset_strength"])
             lines.append(f"  approach speed that a contact takes in its first step: {share}")
         for name, what in (

@@ -17,8 +17,10 @@ from mjx_study.tasks.task import Task
 def all_lost(plan: StudyPlan, dataset: xr.Dataset) -> str | None:
     """Why a study has no number at all, from the first sample of its first cell; None if it has some."""
     kind = plan.kind
-    if bool(np.isfinite(dataset[kind.finite]).any()) or not bool(dataset[kind.computed].notnull().any()):
+    if not dataset.data_vars or bool(np.isfinite(dataset[kind.finite]).any()):
         return None
+    if "start_cost" in dataset and bool(dataset["start_cost"].notnull().any()):
+        return "no final cost is finite, although that at the start is: use a lower --learning-rate"
     cell = plan.cells[0]
     task = plan.task_of(cell).replace(sigma=cell.sigma)
     if cell.model.analytic:

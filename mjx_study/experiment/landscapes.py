@@ -133,11 +133,13 @@ class LandscapeComputation(Computation):
         task = self._plan.task_of(cell)
         if cell.model.analytic:
             return closed_form(objective, position)
+        points = grid(position[0], position[-1], cell.sigma, QUADRATURE, task.noise)
+        if points[1] - points[0] > cell.sigma / 8:  # too coarse for so narrow a noise
+            return None
         if not applies(task):
             return None
         if cell.group not in self._lines:
             self._lines[cell.group] = Line(task)
-        points = grid(position[0], position[-1], cell.sigma, QUADRATURE, task.noise)
         return means(points, *self._lines[cell.group](points, cell.model.contact), position, cell.sigma, task.noise)
 
 

@@ -58,15 +58,14 @@ def together(tallies: Iterable[Tally]) -> Tally:
 
 
 def _met(events: Float[np.ndarray, "rollouts six"]) -> Float[np.ndarray, " nine"]:
-    """Number of rollouts; of those with an onset: their number, sums of the three counts and of the squared strength,
-    and mean and summed squared deviation of the first onset's step. Last, replaced points of all rollouts."""
-    met = events[events[:, 0] > 0]
-    first = met[:, 4]
-    mean = np.mean(first) if len(met) else 0.0
-    sums = np.sum(met[:, :3], axis=0)
-    return np.array(
-        [len(events), len(met), *sums, np.sum(met[:, 3] ** 2), mean, np.sum((first - mean) ** 2), np.sum(events[:, 5])]
-    )
+    """Number of rollouts, and of those with an onset that has a term; sums of the three counts; of the latter the sum
+    of the squared strength, and mean and summed squared deviation of the first onset's step. Last, replaced points."""
+    met, begun = events[events[:, 0] > 0], events[np.isfinite(events[:, 4])]  # none begins where all are missed
+    first = begun[:, 4]
+    mean = np.mean(first) if len(begun) else 0.0
+    sums, squares = np.sum(met[:, :3], axis=0), np.sum(begun[:, 3] ** 2)
+    deviations = np.sum((first - mean) ** 2)
+    return np.array([len(events), len(begun), *sums, squares, mean, deviations, np.sum(events[:, 5])])
 
 
 def _of_both(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -196,7 +196,7 @@ def linear_error(strength: float) -> str:
 
 def _onset_findings(rows: Sequence[Row]) -> list[str]:
     """Report where the onset term may be off: either kind if noise is narrow, else the linear one at long timesteps."""
-    found, corrected = [], [row for row in rows if row.onsets]
+    found, corrected = [], [row for row in rows if row.onsets and row.onset_spread is not None]
     if narrow := [row for row in corrected if row.onset_spread < LEAST_SPREAD]:
         least = min(row.onset_spread for row in narrow)
         found.append(
