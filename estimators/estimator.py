@@ -48,7 +48,7 @@ class Estimator(ABC):
 
     Attributes:
         name: Name on the command line and in files.
-        label: Legend label, if other than the name.
+        label: Legend label of a registered estimator, if other than the name.
         needs: Oracles in `ORACLES`, in the order of the arguments of `combine`.
         formula: Gradient of one sample, in Markdown with LaTeX.
         unbiased: When the estimate is unbiased, in Markdown.

@@ -25,7 +25,7 @@ import yaml
 
 from mjx_study import cli
 from mjx_study.execution import cluster
-from mjx_study.execution.cluster import TRIES
+from mjx_study.execution.cluster import TRIES, connected
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.study import StudyError
 from mjx_study.options.configuration import StudyConfig
@@ -138,6 +138,23 @@ def test_a_local_cluster_leaves_nothing_behind(tmp_path: Path, ended_by: signal.
         running.communicate()
     assert running.returncode == (0 if ended_by is None else 128 + ended_by) and seen == {0o700}
     assert list(scratch.iterdir()) == []
+
+
+@pytest.mark.parametrize(("visible", "gpu"), [(None, "1"), ("4,7", "7"), ("", None)])
+def test_a_worker_has_a_gpu_of_its_own_unless_they_are_hidden(
+    monkeypatch: pytest.MonkeyPatch, visible: str | None, gpu: str | None
+) -> None:
+    monkeypatch.setattr(cluster, "glob", lambda _: ["/dev/nvidia0", "/dev/nvidia1"])
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert cluster._gpu("worker-3") == gpu
+
+
+@pytest.mark.parametrize("address", ["local:0", "local:-1", "slurm:x"])
+def test_a_cluster_has_workers(address: str) -> None:
+    with pytest.raises(ValueError, match="^the cluster must be local:N, slurm:N or an address"), connected(address):
+        pass
 
 
 def test_a_cluster_needs_a_folder() -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import subprocess
+import sys
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -29,7 +30,7 @@ from mjx_study.storage import folder
 from mjx_study.storage.folder import Store, load_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
-from tests.documents import altered, content
+from tests.documents import altered, content, study_document
 from tests.faults import Killed, kill_after
 
 
@@ -243,6 +244,31 @@ def test_a_run_made_longer_survives_a_kill(tmp_path: Path, monkeypatch: pytest.M
         kill_after(patch, lambda path, count: count == moment, folder)
         descended(tmp_path, 8)
     assert descended(tmp_path, 8).drop_vars("seconds").equals(descended(None, 8).drop_vars("seconds"))
+
+
+CLAIMING = """
+import fcntl, sys
+file = open(sys.argv[1], "r+")
+fcntl.lockf(file, fcntl.LOCK_EX, 1, 1)
+print(flush=True)
+input()
+"""
+
+
+def test_a_run_that_another_process_computes_is_not_made_longer(tmp_path: Path) -> None:
+    """Its second cell is claimed; what it finds would be of another study."""
+    short, longer = (study_document(2, kind="descents", iterations=length) for length in (2, 4))
+    (tmp_path / "study.lock").touch()
+    Store.create(tmp_path, short)
+    before = content(tmp_path)
+    command = [sys.executable, "-c", CLAIMING, str(tmp_path / "study.lock")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline()
+        with pytest.raises(StudyError, match="another process computes descents in .*: make them longer once it has"):
+            Store.create(tmp_path, longer)
+        other.kill()
+    assert content(tmp_path) == before
+    assert Store.create(tmp_path, longer).document["config"]["iterations"] == 4
 
 
 def test_what_differs_is_told() -> None:

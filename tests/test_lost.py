@@ -153,3 +153,6 @@ def test_lost_samples_are_told_by_contact_model_and_estimator() -> None:
     )
     assert second.startswith("penalty, K = 100000 N/m: the motion explodes (numbers up to 1e+138)")
     assert lost_samples(study("gradients", models, nonfinite=0.0)) == []
+    own = study("gradients", models, nonfinite=lost).assign_coords(estimator=["zobg", "mine", "aobg"])
+    own.attrs["described"] = json.dumps({"mine": {"label": "Mine", "needs": ["pair"]}})  # registered in another process
+    assert "(Mine 20, AoBG 20)" in lost_samples(own)[0]

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -28,6 +29,7 @@ from mjx_study.reference import ReferenceObjective, Tennis, roll_out
 from mjx_study.results.kind import findings_of
 from mjx_study.results.variables import HISTORY
 from mjx_study.tasks import TASKS, make_task
+from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import StudyDefaults
 from tests.faults import Killed, kill_after
 
@@ -150,6 +152,16 @@ def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:
     np.testing.assert_allclose(after.theta, [[0.9, 1.9], [1, 2], [1, 2], [1, 2]])
     assert after.reason.tolist() == [0, 1, 3, 4]
     np.testing.assert_array_equal(np.isnan(record["cost"]), [False, False, True, False])
+def test_a_metric_without_a_finite_value_is_nan() -> None:
+    found = {"way": np.array([1.0, np.nan, 3.0]), "none": np.array([np.nan, np.inf])}
+    system = SimpleNamespace(observe=lambda theta, keys: found)
+    rollouts: Any = SimpleNamespace(
+        simulator=None, task=SimpleNamespace(analytic=lambda _: system), _evaluation_keys=lambda: None
+    )
+    model = ContactPoint("reference", 1.0, None)
+    np.testing.assert_equal(Backend.metrics(rollouts, jnp.zeros(1), model), {"none": np.nan, "way": 2.0})
+
+
     assert record["nonfinite"][1] == 5
 
 

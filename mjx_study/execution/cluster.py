@@ -27,6 +27,7 @@ from mjx_study.execution.cells import Cells
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import Arrays, Checkpoint, Computation, StudyError, StudyPlan
 from mjx_study.identity import differences, versions
+from mjx_study.options.parser import CLUSTER, COUNT
 from mjx_study.runtime import available_cores, configure, precision
 from mjx_study.watchdog import watch
 
@@ -65,9 +66,11 @@ def connected(cluster: str) -> Generator[Any]:
             core, or one Slurm worker.
 
     Raises:
-        ValueError: Dask is not installed, or the cluster cannot be reached.
+        ValueError: Dask is not installed, the number of workers is none, or the cluster cannot be reached.
     """
     kind, _, count = cluster.partition(":")
+    if kind in ("local", "slurm") and not re.fullmatch(COUNT, cluster.removeprefix(kind)):
+        raise ValueError(f"the cluster must be {CLUSTER}, got {cluster!r}")
     address: Any = cluster
     with ExitStack() as stack:  # closes the client and any workers started here
         try:
@@ -253,5 +256,6 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Computation]:
 def _gpu(worker: Any) -> str | None:
     """GPU of a worker whose name is a number or ends with one after a hyphen; None leaves the choice to JAX."""
     visible, number = os.environ.get("CUDA_VISIBLE_DEVICES"), re.fullmatch(r"(?:.*-)?(\d+)", str(worker))
-    gpus = visible.split(",") if visible else [path.removeprefix("/dev/nvidia") for path in sorted(glob(GPUS))]
+    found = [path.removeprefix("/dev/nvidia") for path in sorted(glob(GPUS))]
+    gpus = found if visible is None else visible.split(",")
     return gpus[int(number[1]) % len(gpus)] if number and len(gpus) > 1 else None

@@ -184,7 +184,8 @@ class Backend:
             return {}
         else:
             found = jax.device_get(self._observe(theta, model.contact, self._evaluation_keys()))
-        return {name: float(np.mean(values, where=np.isfinite(values))) for name, values in sorted(found.items())}
+        finite = {name: (values, np.isfinite(values)) for name, values in sorted(found.items())}
+        return {name: float(np.mean(each, where=ok)) if ok.any() else math.nan for name, (each, ok) in finite.items()}
 
     def _evaluation_keys(self) -> Key[Array, " samples"]:
         key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)

@@ -19,6 +19,7 @@ TASK_OPTIONS: Final = ("timestep", "cone", *BUILDER_OPTIONS)
 SWEEP: Final = "the task's sweep"
 MIDDLE: Final = "the middle one of the task's sweep"
 DEVICES: Final = Option("devices", int, "N", "CPU devices", "[1, 256]", unset="one per core")
+COUNT: Final = r"(:[1-9]\d{0,4})?"  # number of workers, after "local" or "slurm"
 CLUSTER: Final = "local:N, slurm:N or an address such as tcp://host:8786"
 
 
@@ -157,6 +158,6 @@ def known_task(text: str) -> str:
 
 def _cluster(text: str) -> str:
     """Parse a cluster, as for `mjx_study.execution.cluster.connected`."""
-    if re.fullmatch(r"(local|slurm)(:[1-9]\d{0,4})?|(tcp|tls|ws|wss|ucx)://\S+", text):
+    if re.fullmatch(rf"(local|slurm){COUNT}|(tcp|tls|ws|wss|ucx)://\S+", text):
         return text
     raise argparse.ArgumentTypeError(f"must be {CLUSTER}, got {text!r}")

@@ -101,12 +101,17 @@ class Store:
 
     def _extend(self, document: dict[str, Any]) -> None:
         """Turn finished descents into checkpoints of longer ones; safe to repeat after a kill."""
-        for index in range(len(self.document["cells"])):
-            if self.has(index):
+        indices = range(len(self.document["cells"]))
+        with self.claims() as claim:
+            if not all(map(claim, indices)):
+                raise StudyError(
+                    f"another process computes descents in {self.folder}: make them longer once it has ended"
+                )
+            for index in filter(self.has, indices):
                 self.file(index, part=True).write(*self.read_with_versions(index))
                 self.path(index).unlink()
-        self.document |= {"config": document["config"], "resolved": document["resolved"]}
-        self._write_document()
+            self.document |= {"config": document["config"], "resolved": document["resolved"]}
+            self._write_document()
 
     def record(self, seen: Mapping[str, str]) -> None:
         """Add to study.json what else the user's code has read; see `estimators.user_inputs`."""
@@ -233,7 +238,7 @@ def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, acc
     study; `accept_versions` resumes a study begun by other versions.
     """
     document = _document_in(plan, folder, command)
-    return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
+    return Store.create(folder, document, accept_versions=accept_versions)
 
 
 def begun_store(plan: StudyPlan, folder: Path, *, accept_versions: bool = False) -> Store | None:
