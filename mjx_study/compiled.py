@@ -28,9 +28,10 @@ import jax.export
 
 from estimators.user_inputs import inputs_now, observing, sources_and_inputs
 from mjx_study.caches import read_cached, write_cached
+from mjx_study.digest import Digest
 from mjx_study.graph.build import known_libraries, libraries_in, library_ready
 from mjx_study.graph.native import native_identity
-from mjx_study.identity import TraceContents, trace_contents
+from mjx_study.identity import trace_contents
 from mjx_study.runtime import available_cores, precision, traces_folder
 from mjx_study.simulation.scene import Scene
 from mjx_study.tasks.task import Task
@@ -204,12 +205,12 @@ class Compiled:
         return self._whole
 
     @cached_property
-    def _contents(self) -> TraceContents | None:
+    def _contents(self) -> Digest | None:
         if not self._made_of:
             return None
         found = trace_contents(self._made_of)
         if found.opaque:
-            _say_untraceable(found.opaque)
+            _say_untraceable(tuple(found.opaque))
         return None if found.opaque else found
 
     def _key(self, form: str) -> str:
@@ -224,7 +225,7 @@ class Compiled:
         folder = traces_folder()
         if folder is None or self._contents is None:
             return None
-        return folder / f"{hashlib.sha256(repr((self._contents.digest, key)).encode()).hexdigest()[:32]}.trace"
+        return folder / f"{hashlib.sha256(repr((self._contents.hexdigest(), key)).encode()).hexdigest()[:32]}.trace"
 
     def _exportable(
         self, path: Path, types: Sequence[jax.ShapeDtypeStruct], form: Any
@@ -251,9 +252,9 @@ class Compiled:
 
         jitted = jax.jit(_named(of_leaves, self._name))
         try:
-            with observing(path.stem) if self._contents.own else nullcontext():
+            with observing(path.stem) if self._contents.sources.foreign else nullcontext():
                 outputs = jitted.trace(*types).out_info
-            header = _header(structures[0], sources_and_inputs() if self._contents.own else {})
+            header = _header(structures[0], sources_and_inputs() if self._contents.sources.foreign else {})
         except ValueError:  # outputs that cannot be pickled
             return None
         return structures[0].unflatten(outputs), export

@@ -242,7 +242,7 @@ class Digest:
         code, path = function.__code__, source_file(home)
         if code.co_qualname != function.__qualname__:  # which decorators copy
             self._note("code of", code.co_qualname)
-        if path is None or code.co_filename != str(path) or functions_by_name(path)[code.co_qualname] != 1:
+        if path is None or code.co_filename != str(path) or functions_by_name(path.read_bytes())[code.co_qualname] != 1:
             self._code(code)  # from an interactive session, made at run time, or one of several of its name
         names = _names(code)
         for name in sorted(names & function.__globals__.keys()):

@@ -88,13 +88,9 @@ def source_file(module: str) -> Path | None:
     return Path(file) if file is not None and Path(file).is_file() else None
 
 
-def functions_by_name(path: Path) -> Counter[str]:
-    """Number of functions of each qualified name in a source file: two lambdas of one scope have the same."""
-    return _functions_in(path.read_bytes())
-
-
 @functools.lru_cache(100)
-def _functions_in(source: bytes) -> Counter[str]:
+def functions_by_name(source: bytes) -> Counter[str]:
+    """Number of functions of each qualified name in a source: two lambdas of one scope have the same."""
     found, left = Counter[str](), list[types.CodeType]()
     with suppress(SyntaxError, ValueError):
         left.append(compile(source, "<source>", "exec", dont_inherit=True))

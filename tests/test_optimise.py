@@ -143,12 +143,9 @@ def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:
     state = dataclasses.replace(state, reason=jnp.array([0, 0, 3, 0]), first_cost=jnp.array([1.0, 1.0, 1.0, 1e-3]))
     value = jnp.ones((4, 5)).at[3].set(1e6)
     gradient = jnp.ones((4, 5, 2)).at[1].set(jnp.nan)
-    after, record = descent.advance(
-        state,
-        {"differentiation": jax.vmap(lambda f, g: Differentiation(f, g))(value, gradient)},
-        FirstOrder(),
-        optimizer,
-    )
+    batches = {"differentiation": jax.vmap(lambda f, g: Differentiation(f, g))(value, gradient)}
+    advance = jax.vmap(lambda state, batches: descent.advance_one(state, batches, FirstOrder(), optimizer))
+    after, record = advance(state, batches)
     np.testing.assert_allclose(after.theta, [[0.9, 1.9], [1, 2], [1, 2], [1, 2]])
     assert after.reason.tolist() == [0, 1, 3, 4]
     np.testing.assert_array_equal(np.isnan(record["cost"]), [False, False, True, False])

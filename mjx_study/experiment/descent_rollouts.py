@@ -17,7 +17,6 @@ from mjx_study.compiled import Builds, Compiled
 from mjx_study.experiment.iteration import (
     Descent,
     Record,
-    advance,
     advance_one,
     if_going,
     make_optimizer,
@@ -106,9 +105,7 @@ class Backend:
             simulated = self._iterations[estimator]
             return lambda *arguments: simulated(*self._on_device(model, *arguments))
 
-        def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
-            return advance(state, drawn, estimator, self.optimizer)
-
+        update = jax.vmap(lambda state, drawn: advance_one(state, drawn, estimator, self.optimizer))
         compiled = self._iterations.setdefault(estimator, jax.jit(update))
         count = max(1, TOGETHER // self.samples)
 

@@ -60,6 +60,7 @@ class Descents(StudyKind):
     variables = DESCENTS
     columns = ("final_cost", "stopped_seeds", "variance", "alpha", "nonfinite")
     compared = finite = "final_cost"
+    findings = staticmethod(descent_findings)
     computed = "rollouts"
     one_program = True
 
@@ -108,9 +109,6 @@ class Descents(StudyKind):
 
     def computation(self, plan: StudyPlan) -> "DescentComputation":
         return DescentComputation(plan)
-
-    def findings(self, dataset: xr.Dataset) -> list[str]:
-        return descent_findings(dataset)
 
     def drawings(self, dataset: xr.Dataset) -> dict[str, Drawing]:
         from mjx_study.plots.descents import achieved, descent

@@ -71,6 +71,7 @@ class Gradients(StudyKind):
     columns = ("variance", "effective_samples", "top_share", "relative_error", "debiased_error", "squared_bias")
     columns = (*columns, "alpha", "seconds_per_sample", "nonfinite")
     compared = "variance"
+    findings = staticmethod(gradient_findings)
     finite = "gradient_norm"
 
     def check_memory(self, plan: StudyPlan) -> None:
@@ -108,9 +109,6 @@ class Gradients(StudyKind):
 
     def computation(self, plan: StudyPlan) -> "GradientComputation":
         return GradientComputation(plan)
-
-    def findings(self, dataset: xr.Dataset) -> list[str]:
-        return gradient_findings(dataset)
 
     def drawings(self, dataset: xr.Dataset) -> dict[str, Drawing]:
         from mjx_study.plots import gradients as figures

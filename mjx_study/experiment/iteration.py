@@ -125,14 +125,6 @@ def begin(
     return state
 
 
-def advance(
-    state: Descent, batches: dict[str, Any], estimator: Estimator, optimizer: optax.GradientTransformation
-) -> tuple[Descent, Record]:
-    """Advance every active seed by one iteration, given the batches of the estimator's oracles with a leading axis of
-    seeds; return the new state, and the record of the iteration."""
-    return jax.vmap(lambda state, batches: advance_one(state, batches, estimator, optimizer))(state, batches)
-
-
 def advance_one(
     state: Descent,
     batches: dict[str, Any],
@@ -140,7 +132,8 @@ def advance_one(
     optimizer: optax.GradientTransformation,
     samples: Int[Array, ""] | None = None,
 ) -> tuple[Descent, Record]:
-    """Advance a seed as `advance` does; with a number of samples, the rest of the batches is padding."""
+    """Advance an active seed by one iteration, given the batches of the estimator's oracles; return the new state, and
+    the record of the iteration. With a number of samples, the rest of the batches is padding."""
     value, residual = _values(batches[estimator.needs[0]])
     padding = 0
     if samples is None:

@@ -53,6 +53,7 @@ class Landscapes(StudyKind):
     optional = tuple(name for name in LANDSCAPES if name.startswith("exact_"))
     columns = ("least_cost", "least_at", "steepest", "nonfinite")
     finite = "cost"
+    findings = staticmethod(landscape_findings)
     first_order = True
 
     def axes(self, config: Mapping[str, Any]) -> dict[str, Sequence[int]]:
@@ -74,9 +75,6 @@ class Landscapes(StudyKind):
 
     def computation(self, plan: StudyPlan) -> "LandscapeComputation":
         return LandscapeComputation(plan)
-
-    def findings(self, dataset: xr.Dataset) -> list[str]:
-        return landscape_findings(dataset)
 
     def drawings(self, dataset: xr.Dataset) -> dict[str, Drawing]:
         from mjx_study.plots.descents import landscape

@@ -9,8 +9,7 @@ under any contact:
   since beyond some stiffness the local ones are noise; a pilot batch selects candidate and slope.
 """
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable
 from typing import Final
 
 import jax
@@ -39,7 +38,7 @@ others; not a time, so that numbers are the same on any machine."""
 
 
 def estimate_reference(
-    odd: Evaluation, pilot: Evaluation, candidates: Sequence[Float[Array, " params"]], sigma: float
+    odd: Evaluation, pilot: Evaluation, candidates: Iterable[Float[Array, " params"]], sigma: float
 ) -> GradientEstimate:
     """Return an unbiased estimate of grad F from odd parts and the best of several control variates.
 
@@ -151,10 +150,4 @@ def takes_candidates(task: Task) -> bool:
 
 
 _antithetic = jax.jit(estimators.Antithetic().combine)
-
-
-@partial(jax.jit, static_argnames="sigma")
-def _reference_gradient(
-    odd: Evaluation, pilot: Evaluation, candidates: Float[Array, "candidates params"], sigma: float
-) -> GradientEstimate:
-    return estimate_reference(odd, pilot, list(candidates), sigma)
+_reference_gradient = jax.jit(estimate_reference, static_argnames="sigma")

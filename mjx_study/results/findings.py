@@ -171,7 +171,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Bounds, label: Callable[[str], s
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
         mean = f"{label(estimator)}'s mean is"
         if biased:
-            alike = grouped(_by(biased, "stiffness").values(), partial(_share_of, seeds=seeds))
+            alike = grouped(_by(biased, "stiffness").values(), lambda rows, of=seeds: (_share(rows), _often(rows, of)))
             shares = ", ".join(f"{share}{_at(chain(*same))}{often}" for (share, often), same in alike.items())
             least = max(row.bias_p_value for row in biased)
             free = math.isinf(gammas.get((biased[0].task, estimator), 0.0))
@@ -216,10 +216,6 @@ def _onset_findings(rows: Sequence[Row]) -> list[str]:
 
 def _off(row: Row) -> bool:
     return row.bias_p_value <= BIASED_P_VALUE or row.debiased_error > OFF_SE * row.debiased_error_se
-
-
-def _share_of(rows: Sequence[Row], seeds: int) -> tuple[str, str]:
-    return _share(rows), _often(rows, seeds)
 
 
 def _often(rows: Sequence[Row], seeds: int) -> str:

@@ -43,6 +43,7 @@ class StudyResults(ABC):
         compared: variable whose ratio of two estimators is mapped over stiffness and another parameter; None for none.
         computed: variable that is finite in every computed cell.
         finite: variable that has a finite number unless all samples are lost.
+        findings: what the numbers of a Dataset with at least one cell support, as sentences.
     """
 
     name: ClassVar[str]
@@ -53,6 +54,7 @@ class StudyResults(ABC):
     compared: ClassVar[str | None] = None
     computed: ClassVar[str] = "residual"
     finite: ClassVar[str]
+    findings: ClassVar["staticmethod[[xr.Dataset], list[str]]"]
 
     @property
     def quantities(self) -> dict[str, Variable]:
@@ -68,10 +70,6 @@ class StudyResults(ABC):
         axes = {name: len(along) for name, along in self.axes(config).items()}
         own = {"seed": config["seeds"], "estimator": len(config["estimators"]), "param": parameters}
         return {"solref_entry": 2, "solimp_entry": 5, **own, **axes}
-
-    @abstractmethod
-    def findings(self, dataset: xr.Dataset) -> list[str]:
-        """What the numbers support, as sentences; the Dataset has at least one cell."""
 
     @abstractmethod
     def drawings(self, dataset: xr.Dataset) -> dict[str, Drawing]:

@@ -26,11 +26,11 @@ from estimators.user_inputs import inputs_now
 from mjx_study.disk import MAX_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
 from mjx_study.experiment.study import Checkpoint, StudyError, StudyPlan, reason_of
 from mjx_study.identity import ACCEPT, differences
-from mjx_study.options.files import digest_of_json
+from mjx_study.options.files import digest_of_json, validated
 from mjx_study.progress import Progress
 from mjx_study.storage.arrays import CellFile, check_cell
 from mjx_study.storage.dataset import dataset_of
-from mjx_study.storage.manifest import document_of, read_document, read_format, sealed
+from mjx_study.storage.manifest import document_of, read_document, sealed
 from mjx_study.table import as_plain
 
 FORMAT: Final = 4
@@ -131,15 +131,15 @@ class Store:
         try:
             content = read_whole(path, follow=False, most=MAX_BYTES)
             check_no_link(folder / "cells")
-            version = read_format(content)
-            document = read_document(content) if version == FORMAT else {}
+            version = str(validated(dict[str, Any], content).get("format"))
+            document = read_document(content) if version == str(FORMAT) else {}
         except FileNotFoundError as error:
             raise StudyError(f"{folder} holds no study: there is no study.json") from error
         except OSError as error:
             raise StudyError(f"cannot read {error.filename or path}: {reason_of(error)}") from error
         except ValueError as error:
             raise StudyError(f"{path} is damaged ({error}); move the folder away to start again") from error
-        if version != FORMAT:
+        if version != str(FORMAT):
             raise StudyError(f"{path} is of format {version}; this program reads {FORMAT}")
         return cls(folder, document)
 

@@ -6,7 +6,6 @@ import math
 from collections import Counter, defaultdict
 from typing import Annotated, Any, Final, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from estimators import find_estimator
@@ -125,17 +124,6 @@ class StudyDocument(_Part):
         return self
 
 
-class _Format(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-    format: int
-
-
-def read_format(content: bytes | str) -> int:
-    """Format number of a study.json; ValueError if there is none."""
-    return validated(_Format, content).format
-
-
 def sealed(document: dict[str, Any]) -> bytes:
     """Write a study.json, with a digest of everything else in it."""
     return (json.dumps(document | {"digest": digest_of_json(document)}, indent=1) + "\n").encode()
@@ -177,7 +165,8 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         "axes": axes | {"task": _task_names(plan, axes["task"]), "model": _model_names(axes["model"])},
         "resolved": _resolved(plan, places, len(axes["task"])),
         "cells": [
-            {"label": plan.label(cell), "at": at} | _solver_parameters(cell)
+            {"label": plan.label(cell), "at": at}
+            | {name: getattr(cell.model.contact, name, None) for name in ("solref", "solimp")}  # None: the MJCF's
             for cell, at in zip(plan.cells, places, strict=True)
         ],
     }
@@ -211,14 +200,6 @@ def _resolved(plan: StudyPlan, places: list[dict[str, int]], tasks: int) -> list
             entry |= {"parameters": group.task.policy.num_params, "unit": getattr(group.task.policy, "unit", "")}
             entry["damping"] = group.task.defaults.damping or 0.0
     return found
-
-
-def _solver_parameters(cell: StudyCell) -> dict[str, list[float] | None]:
-    """solref and solimp of a cell's contact; None if the MJCF's apply."""
-    contact = cell.model.contact
-    return {
-        name: None if contact is None else np.asarray(getattr(contact, name)).tolist() for name in ("solref", "solimp")
-    }
 
 
 def _task_names(plan: StudyPlan, configured: list[str]) -> list[str]:

@@ -228,7 +228,7 @@ DEFECTS: Final[tuple[Defect, ...]] = (
            "b = 2 * (dampratio or 0.0) * math.sqrt(k)", "b = (dampratio or 0.0) * math.sqrt(k)",
            "c = 2 zeta sqrt(k m) without its 2", ("tests/test_contact.py::test_a_damping_ratio_of_one_is_critical",)),
     Defect("lambdas-of-one-scope", "mjx_study/digest.py",
-           " or functions_by_name(path)[code.co_qualname] != 1:", ":",
+           " or functions_by_name(path.read_bytes())[code.co_qualname] != 1:", ":",
            "the second of two costs has the numbers of the first",
            ("tests/test_own_identity.py::test_a_change_is_refused_and_nothing_else[which of two lambdas]",)),
     Defect("type-beside-the-call", "mjx_study/graph/native.py",
