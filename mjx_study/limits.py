@@ -18,6 +18,8 @@ LARGEST_COORDINATE: Final = 1e10
 """Size of coordinates and velocities from which a state counts as nonfinite [m, rad, m/s or rad/s], as in MuJoCo."""
 MOST_GIB: Final = 16.0
 """Maximum memory for arrays held at once [GiB], as counted by `mjx_study.experiment.memory.check_memory`."""
+MOST_NUMBERS: Final = 500_000_000
+"""Maximum size of a variable of a study, over all of its cells."""
 
 
 def check_count(count: int, what: str, limit: int, change: str) -> None:

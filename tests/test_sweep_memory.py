@@ -64,12 +64,26 @@ def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.Monk
                 np.testing.assert_allclose(other[name], values, rtol=1e-12, err_msg=name)
 
 
-@pytest.mark.parametrize("kind", [{"iterations": 3}, {"points": 3}, {"estimators": ("zobg", "delta")}])
+SEVERAL: list[dict[str, Any]] = [{"iterations": 3, "seeds": 50}, {"points": 3, "seeds": 50}]
+
+
+@pytest.mark.parametrize("kind", [*SEVERAL, {"estimators": ("zobg", "delta")}])
 def test_a_plan_that_needs_too_much_memory_is_refused(kind: dict[str, Any]) -> None:
     changes = {} if "estimators" in kind else {"reference_samples": None}
     assert plan_study(config(samples=(100,), **kind, **changes)).memory < sweep_memory.AT_ONCE["cpu"]
     with pytest.raises(ValueError, match="a cell would take about .* GiB of memory, and the limit is 16 GiB"):
         plan_study(config(samples=(100, 10_000_000), **kind, **changes))
+
+@pytest.mark.parametrize("kind", SEVERAL)
+def test_what_is_not_tested_for_bias_needs_no_memory_for_that(kind: dict[str, Any]) -> None:
+    """16 kB of draws per sample."""
+    assert plan_study(config(samples=(1000,), **kind | {"seeds": 1000}, reference_samples=None)).memory < 1e9
+
+
+def test_a_study_that_could_not_be_opened_again_is_refused() -> None:
+    with pytest.raises(ValueError, match="more than 500000000 numbers, which is the limit: use fewer tasks, seeds"):
+        plan_study(config(samples=(4,), seeds=100_000, points=10_000, reference_samples=None))
+
 
 
 def test_of_gradients_seeds_cost_no_memory() -> None:

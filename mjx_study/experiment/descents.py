@@ -24,7 +24,7 @@ from estimators import Estimator
 from mjx_study.compiled import Builds
 from mjx_study.experiment.descent_rollouts import Backend
 from mjx_study.experiment.iteration import Descent, Record, begin, going, make_optimizer, schedule_factors
-from mjx_study.experiment.memory import check_memory
+from mjx_study.experiment.memory import bytes_per_sample
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import (
@@ -87,12 +87,12 @@ class Descents(StudyKind):
         fixed = [each.name for each in chosen if hasattr(each, "sigma")]
         if config.sigma_schedule and fixed:
             raise OptionError("sigma_schedule", f"changes sigma, and {fixed[0]} holds for one: omit one of them")
-        history = HISTORY_NUMBERS * config.seeds * recipe.iterations
-        check_memory(group.task, chosen, config.seeds * cell.samples, other=history)
-        check_memory(group.task, (), plan.config.settings.evaluation_samples)
 
-    def batches_at_once(self, config: StudyConfig) -> int:
-        return 1
+    def memory(self, plan: StudyPlan, cell: StudyCell) -> int:
+        """Memory held at once [bytes]: the batches and histories of all seeds, or the rollouts of an evaluation."""
+        task, config, recipe = plan.task_of(cell), plan.config, plan.groups[cell.group].descent
+        evaluation = config.settings.evaluation_samples * bytes_per_sample(task, ("evaluation",), 0, draws=0)
+        return max(super().memory(plan, cell) + 8 * HISTORY_NUMBERS * config.seeds * recipe.iterations, evaluation)
 
     def program_of(self, cell: StudyCell) -> Hashable:
         return super().program_of(cell), cell.sigma, cell.samples

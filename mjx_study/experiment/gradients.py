@@ -83,7 +83,8 @@ class Gradients(StudyKind):
                 f"splits batches, and {', '.join(whole)} must have whole ones: omit it; {memory.blocks_take(whole)}"
             )
             raise OptionError("block_size", reason)
-        memory.check_batches(plan.memory, whole)
+        change = f"; or omit {', '.join(whole)}: {memory.blocks_take(whole)}" if whole else ""
+        memory.check_batches(plan.memory, f"use fewer samples and more seeds{change}")
 
     def memory(self, plan: StudyPlan, cell: StudyCell) -> int:
         """Memory held at once [bytes]: batches and statistics, or a block, and moments until a batch is complete."""

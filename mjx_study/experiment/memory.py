@@ -59,13 +59,10 @@ def bytes_of_moments(estimators: Sequence[Estimator], params: int) -> int:
     return 8 * sum(size * (size + 6 * EXTREMES) for each in sizes for size in each)
 
 
-def check_batches(needed: int, whole: Sequence[str] = ()) -> None:
-    """Raise ValueError for batches that need more memory than `MOST_GIB`, with what to change; `whole` names estimators
-    that need whole batches, where others could use blocks."""
+def check_batches(needed: int, change: str) -> None:
+    """Raise ValueError for batches that need more memory than `MOST_GIB`, with what to change."""
     gib = needed / 2**30
     if gib > MOST_GIB:
-        change = "use fewer samples and more seeds"
-        change += f"; or omit {', '.join(whole)}: {blocks_take(whole)}" if whole else ""
         raise ValueError(
             f"the batches of a cell would take about {gib:.3g} GiB of memory, and the limit is {MOST_GIB:g} GiB: "
             f"{change}"
@@ -78,9 +75,8 @@ def blocks_take(whole: Sequence[str]) -> str:
     return f"batches of any size are for {', '.join(able)}, without leave_one_out and cross_fitted"
 
 
-def _gib(task: Task, estimators: Sequence[Estimator], samples: int, other: int = 0) -> float:
-    each = bytes_per_sample(task, oracles_of(estimators, "evaluation"), len(estimators), draws=0)
-    return (samples * each + 8 * other) / 2**30
+def _gib(task: Task, estimators: Sequence[Estimator], samples: int) -> float:
+    return samples * bytes_per_sample(task, oracles_of(estimators, "evaluation"), len(estimators), draws=0) / 2**30
 
 
 def fits_in_memory(task: Task, estimators: Sequence[Estimator], samples: int) -> bool:
@@ -88,10 +84,9 @@ def fits_in_memory(task: Task, estimators: Sequence[Estimator], samples: int) ->
     return _gib(task, estimators, samples) <= MOST_GIB
 
 
-def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, other: int = 0) -> None:
-    """Raise ValueError for arrays that do not fit into `MOST_GIB`, with what to change; `other` is the number of
-    further numbers kept."""
-    if (gib := _gib(task, estimators, samples, other)) > MOST_GIB:
+def check_memory(task: Task, estimators: Sequence[Estimator], samples: int) -> None:
+    """Raise ValueError for arrays that do not fit into `MOST_GIB`, with what to change."""
+    if (gib := _gib(task, estimators, samples)) > MOST_GIB:
         raise ValueError(
             f"{samples} samples of {task.policy.num_params} parameters and {task.horizon} steps need {gib:.3g} GiB of "
             f"memory, and the limit is {MOST_GIB:g} GiB: use fewer samples, seeds or steps, or split them over several "

@@ -13,7 +13,7 @@ from estimators.noise import check_sigma
 from mjx_study.choices import CONES, REFERENCE
 from mjx_study.experiment.memory import LARGEST_BATCH
 from mjx_study.experiment.resolution import at_theta, reject_unused_options
-from mjx_study.experiment.study import Group, StudyCell, StudyKind, StudyPlan, estimators_of
+from mjx_study.experiment.study import Group, StudyCell, StudyKind, StudyPlan, check_numbers, estimators_of
 from mjx_study.graph.native import in_numpy
 from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for, natively
@@ -82,7 +82,8 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
             check_sigma(sigma)
             cells.append(StudyCell(len(groups), model, sigma, samples))
         groups.append(group)
-    most = max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * kind.batches_at_once(config)
+    together = 1 if kind.one_program else config.seeds
+    most = max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * together
     tasks = [group.task for group in groups]
     most = min(LARGEST_BATCH[jax.default_backend()], most)
     size = config.chunk_size
@@ -90,6 +91,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, 
         size = chunk_for(most, local_devices(), tasks, own_program=kind.one_program)
     plan = StudyPlan(config, tuple(groups), tuple(cells), size, tuple(dict.fromkeys(messages)))
     kind.check_memory(plan)
+    check_numbers(plan.axes, plan.fields)
     steps = in_numpy() and sum(int(kind.rollouts(plan, cell)[0]) * plan.task_of(cell).horizon for cell in cells)
     if steps > LONG_IN_NUMPY:
         message = f"NumPy computes {count(steps)} steps: with a C compiler they take a tenth of the time"

@@ -7,7 +7,7 @@ any order and anywhere, since each depends on the plan alone.
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Hashable, Mapping
+from collections.abc import Callable, Generator, Hashable, Mapping, Sized
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import cached_property
@@ -22,6 +22,7 @@ from estimators.user_inputs import inputs_read
 from mjx_study.experiment.memory import bytes_per_sample, check_batches, padded_size
 from mjx_study.experiment.resolution import configured_estimators
 from mjx_study.identity import contents, estimator_contents
+from mjx_study.limits import MOST_NUMBERS
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.kind import StudyResults, find_kind
 from mjx_study.table import digits_to_tell_apart
@@ -135,6 +136,27 @@ class StudyPlan:
 
     @property
     def contents(self) -> dict[str, str]:
+    @cached_property
+    def coordinates(self) -> list[dict[str, Any]]:
+        """Exact coordinates of every cell on the study's axes."""
+        return [
+            {
+                "task": (group := self.groups[cell.group]).name,
+                "timestep": group.timestep,
+                "cone": group.cone,
+                "model": (cell.model.family, cell.model.stiffness_or_zero),
+                "sigma": cell.sigma,
+                "samples": cell.samples,
+            }
+            for cell in self.cells
+        ]
+
+    @cached_property
+    def axes(self) -> dict[str, list[Any]]:
+        """The values of all cells along each axis: numbers sorted, others in the order of the configuration."""
+        axes = {name: list(dict.fromkeys(each[name] for each in self.coordinates)) for name in self.coordinates[0]}
+        return axes | {name: sorted(axes[name]) for name in ("timestep", "sigma", "samples")}
+
         forms: dict[str, list[Task]] = {}
         for group in self.groups:
             forms.setdefault(group.name, []).append(group.task)
@@ -172,6 +194,16 @@ def estimators_of(plan: StudyPlan, cell: StudyCell) -> tuple[Estimator, ...]:
 
 class StudyError(ValueError):
     """A folder holds no study, another study, or a damaged file."""
+def check_numbers(axes: Mapping[str, Sized], config: Mapping[str, Any]) -> None:
+    """Raise ValueError for a study with a variable of more than `MOST_NUMBERS` numbers, given the axes of all cells."""
+    inner = config["seeds"] * len(config["estimators"]) * max(config["iterations"] or 1, config["points"] or 1)
+    if math.prod(map(len, axes.values())) * inner > MOST_NUMBERS:
+        raise ValueError(
+            f"a variable would have more than {MOST_NUMBERS} numbers, which is the limit: use fewer tasks, seeds, "
+            "iterations or points"
+        )
+
+
 
 
 def reason_of(error: Exception) -> str:
@@ -265,11 +297,7 @@ class StudyKind(StudyResults):
 
     def check_memory(self, plan: StudyPlan) -> None:
         """Raise ValueError for batches that do not fit into memory."""
-        check_batches(plan.memory)
-
-    def batches_at_once(self, config: StudyConfig) -> int:
-        """Number of batches whose samples run in the same calls."""
-        return config.seeds
+        check_batches(plan.memory, "use fewer samples or seeds")
 
     def program_of(self, cell: StudyCell) -> Hashable:
         """Key of the compiled programs of a cell with MJX."""
@@ -280,8 +308,9 @@ class StudyKind(StudyResults):
         return 2
 
     def memory(self, plan: StudyPlan, cell: StudyCell) -> int:
-        """Memory held at once [bytes]: the batches and statistics of all seeds."""
-        return plan.memory_of_seed(cell) * plan.config.seeds
+        """Memory held at once [bytes]: the batches of all seeds."""
+        each = bytes_per_sample(plan.task_of(cell), plan.oracles, len(plan.config.estimators), draws=0)
+        return plan.padded_samples(cell) * plan.config.seeds * each
 
     def size(self, plan: StudyPlan, cell: StudyCell) -> int:
         """Size of a cell's arrays [bytes]."""

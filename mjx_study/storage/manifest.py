@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from collections import Counter, defaultdict
 from typing import Annotated, Any, Final, Literal
 
@@ -13,7 +12,7 @@ from estimators.choices import ORACLES
 from estimators.intervals import Interval
 from estimators.registry import ESTIMATORS, label_of
 from mjx_study.choices import KINDS, ONSETS
-from mjx_study.experiment.study import StudyCell, StudyPlan, estimators_of
+from mjx_study.experiment.study import StudyPlan, check_numbers, estimators_of
 from mjx_study.graph.native import computes_steps
 from mjx_study.identity import git_revision, versions
 from mjx_study.options.configuration import OPTIONS
@@ -21,7 +20,6 @@ from mjx_study.options.files import digest_of_json, validated
 from mjx_study.runtime import environment
 from mjx_study.table import digits_to_tell_apart
 
-MOST_NUMBERS: Final = 500_000_000  # maximum size of a variable of a study
 SEEDS: Final = Interval(OPTIONS["seeds"].interval)
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -118,9 +116,7 @@ class StudyDocument(_Part):
         for name in config.estimators:
             if name not in ESTIMATORS and name not in self.described:
                 raise ValueError(f"config.estimators has {name!r}, which is neither built in nor described")
-        inner = config.seeds * len(config.estimators) * max(config.iterations or 1, config.points or 1)
-        if math.prod(axes.values()) * inner > MOST_NUMBERS:
-            raise ValueError(f"a variable would have more than {MOST_NUMBERS} numbers, which is the limit")
+        check_numbers(vars(self.axes), vars(config))
         return self
 
 
@@ -141,12 +137,9 @@ def read_document(content: bytes | str) -> dict[str, Any]:
 
 def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
     """The document of a plan. Coordinates are compared exactly, not by their printed names."""
-    exact = [_coordinates(plan, cell) for cell in plan.cells]
-    axes = {name: list(dict.fromkeys(each[name] for each in exact)) for name in exact[0]}
-    for name in ("timestep", "sigma", "samples"):  # the others keep the order of the configuration
-        axes[name].sort()
+    axes = plan.axes
     index = {name: {value: place for place, value in enumerate(along)} for name, along in axes.items()}
-    places = [{name: index[name][value] for name, value in each.items()} for each in exact]
+    places = [{name: index[name][value] for name, value in each.items()} for each in plan.coordinates]
     named = zip(plan.config.estimator_names, map(find_estimator, plan.config.estimators), strict=True)
     return {
         "config": plan.fields,
@@ -169,18 +162,6 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
             | {name: getattr(cell.model.contact, name, None) for name in ("solref", "solimp")}  # None: the MJCF's
             for cell, at in zip(plan.cells, places, strict=True)
         ],
-    }
-
-
-def _coordinates(plan: StudyPlan, cell: StudyCell) -> dict[str, Any]:
-    group = plan.groups[cell.group]
-    return {
-        "task": group.name,
-        "timestep": group.timestep,
-        "cone": group.cone,
-        "model": (cell.model.family, cell.model.stiffness_or_zero),
-        "sigma": cell.sigma,
-        "samples": cell.samples,
     }
 
 
