@@ -67,22 +67,7 @@ def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
     return found | dict(sorted(parts.items()))
 
 
-@dataclasses.dataclass(frozen=True)
-class TraceContents:
-    """What a trace depends on except its arguments and JAX's settings.
-
-    Attributes:
-        digest: of exact values and models, and code.
-        own: whether user-defined or installed code is involved.
-        opaque: values whose content cannot be digested.
-    """
-
-    digest: str
-    own: bool
-    opaque: tuple[str, ...]
-
-
-def trace_contents(made_of: Any) -> TraceContents:
+def trace_contents(made_of: Any) -> Digest:
     """Digest everything a trace depends on except its arguments and JAX's settings.
 
     Installed packages enter by the names of their folders of metadata, which hold the versions.
@@ -90,7 +75,7 @@ def trace_contents(made_of: Any) -> TraceContents:
     digest = Digest((made_of, [version_of(name) for name in VERSIONED], computing_code()), exact=True)
     if digest.sources.foreign:
         digest.add((sorted(digest.parts.items()), installed_packages()))
-    return TraceContents(digest.hexdigest(), digest.sources.foreign, tuple(digest.opaque))
+    return digest
 
 
 @functools.cache

@@ -11,8 +11,9 @@ from estimators.merged_samples import moments_of
 from mjx_study.experiment.merged_samples import Blocks, pack
 from mjx_study.experiment.study import Checkpoint, StudyError
 from mjx_study.experiment.tally import Tally
+from mjx_study.limits import MOST_GIB
 from mjx_study.storage import arrays as module
-from mjx_study.storage.arrays import read_arrays, write_arrays
+from mjx_study.storage.arrays import read_arrays
 from mjx_study.storage.folder import Store
 from tests.documents import cell_arrays, study_document
 from tests.fuzz.forgeries import npy, packed
@@ -23,7 +24,7 @@ def test_arrays_come_back(tmp_path: Path) -> None:
     given = {"a": rng.normal(size=(2, 3)), "b": np.asfortranarray(rng.normal(size=(3, 2))), "c": np.array(["x", "yz"]),
              "d": np.array(3), "e": np.zeros((0, 4)), "f": np.array(""), "g": np.array([True])}  # fmt: skip
     with path.open("wb") as file:
-        write_arrays(file, given)
+        np.savez(file, **given)
     found = read_arrays(path.read_bytes())
     assert found.keys() == given.keys() and all(found[name].dtype == given[name].dtype for name in given)
     for name, array in given.items():
@@ -51,6 +52,10 @@ def test_a_file_of_too_many_arrays_is_refused(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(module, "MOST_MEMBERS", 2)
     with pytest.raises(ValueError, match="it holds more than 2 arrays"):
         read_arrays(packed({name: npy((0,)) for name in "abc"}))
+
+
+def test_a_checkpoint_may_be_as_large_as_the_memory_of_a_plan() -> None:
+    assert module.MOST_CELL_BYTES >= MOST_GIB * 2**30
 
 
 DOCUMENT = study_document(2)

@@ -59,13 +59,13 @@ def test_a_model_counts_by_what_it_simulates(tmp_path: Path) -> None:
     model = scene.model.replace(body_mass=2 * scene.model.body_mass)
     moved = base.replace(scene=dataclasses.replace(scene, model=model))
     assert changed(base, moved) == {"model of it"}
-
     tiny = 1e-11 * scene.model.body_inertia  # of a sphere of 2 mm, in kg m2
     small, doubled = (
         base.replace(scene=dataclasses.replace(scene, model=scene.model.replace(body_inertia=each)))
         for each in (tiny, 2 * tiny)
     )
     assert changed(small, doubled) == {"model of it"}
+
 
 def test_every_part_of_a_task_counts() -> None:
     """But for the words that describe it."""
@@ -82,16 +82,15 @@ def test_every_part_of_a_task_counts() -> None:
 def test_arrays_count_by_value_to_twelve_digits() -> None:
     array = np.array([1.0, -0.3, 0.0, np.inf, np.nan])
     assert digest_of(array) == digest_of(array * (1 + 1e-15)) != digest_of(array * (1 + 1e-9))
-    others = (array, -array, array[:4], array.reshape(5, 1), [1.0, 2.0], (2.0, 1.0))
     for power in (0.5, 1.0, -2.0):
         assert digest_of(np.nextafter(power, 0)) == digest_of(power) == digest_of(np.nextafter(power, 9 * power))
+    others = (array, -array, array[:4], array.reshape(5, 1), [1.0, 2.0], (2.0, 1.0))
     assert len(set(map(digest_of, others))) == len(others)
     cycle: list[Any] = [1]
     cycle.append(cycle)
     assert digest_of(cycle) == digest_of(cycle)
 
 
-class Mapped(dict[str, float]):
 def test_a_function_made_by_exec_counts_by_its_code() -> None:
     def made(text: str) -> Any:
         namespace: dict[str, Any] = {}
@@ -101,6 +100,7 @@ def test_a_function_made_by_exec_counts_by_its_code() -> None:
     assert digest_of(made("state + 1")) == digest_of(made("state + 1")) != digest_of(made("state - 1"))
 
 
+class Mapped(dict[str, float]):
     """A dict with an attribute."""
 
     def __init__(self, by: float):

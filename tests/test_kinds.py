@@ -13,6 +13,7 @@ import xarray as xr
 
 import mjx_study.report  # noqa: F401  # registers `Dataset.mjx_study`
 from mjx_study.choices import KINDS
+from mjx_study.execution import cells
 from mjx_study.execution.cells import Cells, compute_here
 from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.run import run_study
@@ -23,13 +24,12 @@ from mjx_study.options.configuration import StudyConfig
 from mjx_study.progress import silent
 from mjx_study.report import render_report
 from mjx_study.results.kind import find_kind, findings_of
-from mjx_study.results.variables import MEASURED
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage import arrays as cell_files
 from mjx_study.storage import folder
 from mjx_study.storage.arrays import required
 from mjx_study.storage.folder import Store, load_study
-from tests.documents import content, same, study_document
+from tests.documents import MEASURED, content, same, study_document
 from tests.faults import Killed, kill_after
 from tests.processes import ROOT
 from tests.test_layering import FILES
@@ -114,7 +114,8 @@ def test_a_killed_run_resumes_to_the_same_numbers(
     """Killed after one of its first writes of a cell or a checkpoint."""
     with monkeypatch.context() as patch:
         written = kill_after(patch, lambda path, count: count == moment)
-        patch.setattr(descents, "SAVE_SECONDS", 0.0)
+        for module in (descents, cells):
+            patch.setattr(module, "SAVE_SECONDS", 0.0)
         with pytest.raises(Killed):
             run_study(config(name), tmp_path)
     assert load_study(tmp_path).attrs["missing_cells"] or len(written) == len(list(tmp_path.glob("cells/*")))

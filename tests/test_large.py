@@ -16,6 +16,7 @@ import psutil
 import pytest
 
 from mjx_study import cli
+from mjx_study.execution import cells
 from mjx_study.execution.cluster import TRIES
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import gradients
@@ -25,9 +26,10 @@ from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.sampling import cell_keys, sample_keys
 from mjx_study.experiment.study import Arrays, Checkpoint, StudyPlan
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.results.variables import MEASURED
-from mjx_study.storage.folder import Store, load_study
-from tests.documents import numbers_of, same
+from mjx_study.progress import silent
+from mjx_study.storage.arrays import CellFile
+from mjx_study.storage.folder import Store, load_study, open_store
+from tests.documents import MEASURED, numbers_of, same
 from tests.poison import ACCOUNT, RAISE, SLOW
 
 SUBSTITUTES = {"bias_p_value", "variance_lower", "variance_upper"}
@@ -112,6 +114,28 @@ def test_not_a_bit_depends_on_the_order_or_on_checkpoints(cell: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, found.numbers(), expected.numbers())
 
 
+def test_checkpoints_are_written_now_and_then_and_read_once(
+    cell: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of eleven blocks and a reference, each is finished at once."""
+    computation, plan, units = cell
+    saved: list[Arrays] = []
+    for seconds, count in ((20.0, 0), (0.0, 11)):
+        monkeypatch.setattr(cells, "SAVE_SECONDS", seconds)
+        begun = cells.Cells(plan, computation, silent, lambda *_: Checkpoint(save=saved.append))
+        finished = [begun.finish(0, unit, units[unit]) is not None for unit in begun.begin(0)]
+        assert finished == [False] * 11 + [True] and len(saved) == count
+    read: list[Path] = []
+    read_file = CellFile.read
+    monkeypatch.setattr(CellFile, "read", lambda file, *check: read.append(file.path) or read_file(file, *check))
+    store = open_store(plan, tmp_path)
+    for _ in range(2):
+        checkpoint = store.checkpoint(0, silent)
+        for arrays in saved[:3]:
+            checkpoint.save(arrays)
+    assert read == [store.part_path(0)]
+
+
 def test_a_study_in_blocks_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped in the fourth block: the other process computes the rest, to the same bits."""
     done: list[int] = []
@@ -124,6 +148,7 @@ def test_a_study_in_blocks_goes_on_where_it_was_stopped(tmp_path: Path, monkeypa
         return compute(self, cell, unit, checkpoint)
 
     monkeypatch.setattr(GradientComputation, "compute", stopping)
+    monkeypatch.setattr(cells, "SAVE_SECONDS", 0.0)
     with pytest.raises(KeyboardInterrupt):
         run_study(config(), tmp_path / "study")
     assert done == [0, 1, 2, 3] and len(list((tmp_path / "study" / "cells").glob("*.part.npz"))) == 1
@@ -189,11 +214,14 @@ ARGUMENTS = ["compare", "pusher", "--contact", "reference", "--stiffness", "100"
              "--block-size", "20", "--estimators", "zobg,fobg,aobg", "--reference-samples", "20"]  # fmt: skip
 
 
+SAVING = "from mjx_study import cli; from mjx_study.execution import cells; cells.SAVE_SECONDS = 0; exit(cli.main())"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [[], ["--cluster", "local:2"]])
 def test_a_killed_command_goes_on_to_the_same_data(cluster: list[str], tmp_path: Path) -> None:
     """The command itself, killed by SIGKILL after its fifth block."""
-    command = [sys.executable, "-m", "mjx_study", *ARGUMENTS, *cluster, "--output"]
+    command = [sys.executable, "-c", SAVING, *ARGUMENTS, *cluster, "--output"]
     folder = tmp_path / "out"
     running = subprocess.Popen([*command, str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     part = folder / "cells" / "00000.part.npz"

@@ -149,6 +149,9 @@ def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:
     np.testing.assert_allclose(after.theta, [[0.9, 1.9], [1, 2], [1, 2], [1, 2]])
     assert after.reason.tolist() == [0, 1, 3, 4]
     np.testing.assert_array_equal(np.isnan(record["cost"]), [False, False, True, False])
+    assert record["nonfinite"][1] == 5
+
+
 def test_a_metric_without_a_finite_value_is_nan() -> None:
     found = {"way": np.array([1.0, np.nan, 3.0]), "none": np.array([np.nan, np.inf])}
     system = SimpleNamespace(observe=lambda theta, keys: found)
@@ -157,9 +160,6 @@ def test_a_metric_without_a_finite_value_is_nan() -> None:
     )
     model = ContactPoint("reference", 1.0, None)
     np.testing.assert_equal(Backend.metrics(rollouts, jnp.zeros(1), model), {"none": np.nan, "way": 2.0})
-
-
-    assert record["nonfinite"][1] == 5
 
 
 def test_a_diverging_run_keeps_its_history_and_says_why() -> None:

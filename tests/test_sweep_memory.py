@@ -14,9 +14,8 @@ from mjx_study.experiment.gradients import seeds_together
 from mjx_study.experiment.plan import plan_study
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.results.variables import MEASURED
 from mjx_study.simulation.contact import ContactModel
-from tests.documents import numbers_of
+from tests.documents import MEASURED, numbers_of
 from tests.processes import run_script
 
 
@@ -74,6 +73,7 @@ def test_a_plan_that_needs_too_much_memory_is_refused(kind: dict[str, Any]) -> N
     with pytest.raises(ValueError, match="a cell would take about .* GiB of memory, and the limit is 16 GiB"):
         plan_study(config(samples=(100, 10_000_000), **kind, **changes))
 
+
 @pytest.mark.parametrize("kind", SEVERAL)
 def test_what_is_not_tested_for_bias_needs_no_memory_for_that(kind: dict[str, Any]) -> None:
     """16 kB of draws per sample."""
@@ -83,7 +83,6 @@ def test_what_is_not_tested_for_bias_needs_no_memory_for_that(kind: dict[str, An
 def test_a_study_that_could_not_be_opened_again_is_refused() -> None:
     with pytest.raises(ValueError, match="more than 500000000 numbers, which is the limit: use fewer tasks, seeds"):
         plan_study(config(samples=(4,), seeds=100_000, points=10_000, reference_samples=None))
-
 
 
 def test_of_gradients_seeds_cost_no_memory() -> None:

@@ -10,7 +10,6 @@ import numpy as np
 
 from mjx_study.execution import cluster
 from mjx_study.execution.cells import Cells
-from mjx_study.experiment.study import Work
 from mjx_study.progress import silent
 from mjx_study.storage.folder import Store
 
@@ -41,8 +40,8 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
     class Computation:
         """Cells of one work unit."""
 
-        def begin(self, cell: int, checkpoint: Any) -> Work:
-            return Work()
+        def begin(self, cell: int, checkpoint: Any) -> None:
+            pass
 
     index = {"cells": [{"label": str(cell), "at": {}} for cell in range(cells)], "config": {}}
     replaced = {"_compute": sleep, "_packed": lambda plan: b""}

@@ -1,11 +1,12 @@
 """The cells that a run computes: work units, checkpoints and progress, wherever a unit is computed."""
 
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future
 from typing import Any
 
-from mjx_study.experiment.study import Arrays, Checkpoint, Computation, StudyPlan, Work
+from mjx_study.experiment.study import SAVE_SECONDS, Arrays, Checkpoint, Computation, StudyPlan
 from mjx_study.progress import Progress
 
 
@@ -26,7 +27,8 @@ class Cells:
         self.plan, self.computation = plan, computation
         self._progress, self._checkpoint = progress, checkpoint
         self.done = 0
-        self._works: dict[int, tuple[Checkpoint, Work]] = {}
+        self._works: dict[int, tuple[Checkpoint, Any]] = {}
+        self._saved: dict[int, float] = {}  # times of the last checkpoints
         self._compiled: set[Any] = {None}
 
     def begin(self, index: int) -> list[int]:
@@ -35,8 +37,8 @@ class Cells:
         within = self._progress if alone else lambda done, total, what: self.report(label)
         checkpoint = self._checkpoint(index, within)
         work = self.computation.begin(self.plan.cells[index], checkpoint)
-        self._works[index] = checkpoint, work
-        return work.missing
+        self._works[index], self._saved[index] = (checkpoint, work), time.monotonic()
+        return [0] if work is None else work.missing
 
     def compute(self, index: int, unit: int) -> Future[Arrays]:
         return self.computation.compute(self.plan.cells[index], unit, self._works[index][0])
@@ -44,20 +46,25 @@ class Cells:
     def kept(self, index: int) -> Arrays:
         """Checkpoint of a cell of one unit, which that unit continues."""
         checkpoint, work = self._works[index]
-        return dict(checkpoint.kept) if work.units == 1 else {}
+        return dict(checkpoint.kept) if work is None else {}
 
     def finish(self, index: int, unit: int, arrays: Arrays) -> Arrays | None:
         """Add what a unit found; return the cell's numbers if no other unit is missing."""
         checkpoint, work = self._works[index]
-        work.add(unit, arrays)
-        if work.units > 1:
-            checkpoint.save(work.arrays())
+        if work is not None:
+            work.add(unit, arrays)
             left = len(work.missing)
+            if left and time.monotonic() - self._saved[index] >= SAVE_SECONDS:
+                checkpoint.save(work.arrays())
+                self._saved[index] = time.monotonic()
             checkpoint.report(work.units - left, work.units, f"{self.label(index)}, in blocks")
-        return None if work.missing else self.end(index)
+            return None if left else self.end(index)
+        self.drop(index)
+        self.done += 1
+        return arrays
 
     def end(self, index: int) -> Arrays:
-        """The numbers of a cell of which no unit is missing."""
+        """The numbers of a cell in blocks, none of which is missing."""
         self.done += 1
         return self._works.pop(index)[1].numbers()
 

@@ -28,6 +28,7 @@ from mjx_study.experiment.memory import bytes_per_sample
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import (
+    SAVE_SECONDS,
     Arrays,
     Checkpoint,
     Computation,
@@ -49,8 +50,6 @@ from mjx_study.tasks.task import Recipe, Task
 HISTORY_NUMBERS: Final = 20  # approximate count of numbers kept per iteration and seed, over all estimators
 REPORT_EVERY: Final = 10
 """Iterations between progress reports, which wait for the device."""
-SAVE_SECONDS: Final = 20.0
-"""Seconds between checkpoints."""
 
 
 class Descents(StudyKind):
@@ -60,8 +59,8 @@ class Descents(StudyKind):
     variables = DESCENTS
     columns = ("final_cost", "stopped_seeds", "variance", "alpha", "nonfinite")
     compared = finite = "final_cost"
-    findings = staticmethod(descent_findings)
     computed = "rollouts"
+    findings = staticmethod(descent_findings)
     one_program = True
 
     def axes(self, config: Mapping[str, Any]) -> dict[str, Sequence[int]]:

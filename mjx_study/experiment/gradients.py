@@ -43,7 +43,6 @@ from mjx_study.experiment.study import (
     StudyCell,
     StudyKind,
     StudyPlan,
-    Work,
     done,
     estimators_of,
 )
@@ -71,8 +70,8 @@ class Gradients(StudyKind):
     columns = ("variance", "effective_samples", "top_share", "relative_error", "debiased_error", "squared_bias")
     columns = (*columns, "alpha", "seconds_per_sample", "nonfinite")
     compared = "variance"
-    findings = staticmethod(gradient_findings)
     finite = "gradient_norm"
+    findings = staticmethod(gradient_findings)
 
     def check_memory(self, plan: StudyPlan) -> None:
         """Raise ValueError for batches that do not fit into memory, OptionError for a block size with estimators that
@@ -199,10 +198,10 @@ class GradientComputation(Computation):
         """Keys of the candidates, which all parts of the reference share."""
         return jax.random.split(self._keys["reference"][1], CANDIDATES)
 
-    def begin(self, cell: StudyCell, checkpoint: Checkpoint) -> Work:
+    def begin(self, cell: StudyCell, checkpoint: Checkpoint) -> Blocks | None:
         blocks = blocks_of(self._plan, cell)
         if blocks == 1:
-            return Work()
+            return None
         with checkpoint.restored():
             work = Blocks(self._config.seeds, blocks, checkpoint.kept, partial(self._merged, cell))
             chosen = estimators_of(self._plan, cell)
@@ -222,7 +221,7 @@ class GradientComputation(Computation):
     def _block(self, cell: StudyCell, unit: int) -> Arrays:
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
         chosen, size = estimators_of(self._plan, cell), block_of(self._plan, cell)
-        seed, index = Blocks.position(unit, blocks_of(self._plan, cell))
+        seed, index = divmod(unit - 1, blocks_of(self._plan, cell))
         first, every = index * size, math.ceil(cell.samples / MAX_THINNED)
         count, oracles = min(size, cell.samples - first), estimators.oracles_of(chosen)
         some = slice(seed, seed + 1)

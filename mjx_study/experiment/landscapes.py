@@ -131,10 +131,10 @@ class LandscapeComputation(Computation):
         task = self._plan.task_of(cell)
         if cell.model.analytic:
             return closed_form(objective, position)
+        if not applies(task):
+            return None
         points = grid(position[0], position[-1], cell.sigma, QUADRATURE, task.noise)
         if points[1] - points[0] > cell.sigma / 8:  # too coarse for so narrow a noise
-            return None
-        if not applies(task):
             return None
         if cell.group not in self._lines:
             self._lines[cell.group] = Line(task)

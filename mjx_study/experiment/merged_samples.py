@@ -13,7 +13,7 @@ import numpy as np
 
 from estimators import ORACLES
 from estimators.merged_samples import Moments
-from mjx_study.experiment.study import Arrays, Work
+from mjx_study.experiment.study import Arrays
 from mjx_study.experiment.tally import Tally
 
 REFERENCE_UNIT: Final = 0
@@ -22,7 +22,7 @@ Summary = dict[str, Any]
 """Summary of a block: moments of each estimator's parts by "ESTIMATOR.PART", and tallies by oracle."""
 
 
-class Blocks(Work):
+class Blocks:
     """The blocks of a cell's batches as work units, with the summaries of the finished ones.
 
     Attributes:
@@ -70,33 +70,32 @@ class Blocks(Work):
 
     @property
     def missing(self) -> list[int]:
+        """Unfinished units, in order."""
         done = np.zeros((self.seeds, self.blocks), bool)
         for seed, level, index in self._held:
             done[seed, index << level : (index + 1) << level] = True
         return [REFERENCE_UNIT] * (self.reference is None) + (1 + np.flatnonzero(~done)).tolist()
 
-    @staticmethod
-    def position(unit: int, blocks: int) -> tuple[int, int]:
-        """Seed of a unit's block, and its index within the seed."""
-        return divmod(unit - 1, blocks)
-
     def add(self, unit: int, arrays: Arrays) -> None:
+        """Add what a unit found."""
         if unit == REFERENCE_UNIT:
             self.reference = arrays["reference"]
             return
-        (seed, index), level, summary = self.position(unit, self.blocks), 0, unpack(arrays)
+        (seed, index), level, summary = divmod(unit - 1, self.blocks), 0, unpack(arrays)
         while (other := self._held.pop((seed, level, index ^ 1), None)) is not None:
             summary = _merged(other, summary) if index % 2 else _merged(summary, other)
             level, index = level + 1, index // 2
         self._held[seed, level, index] = summary
 
     def arrays(self) -> Arrays:
+        """The checkpoint of the finished units."""
         kept = {} if self.reference is None else {"reference": self.reference}
         for (seed, level, index), summary in self._held.items():
             kept |= {f"{seed}.{level}.{index}.{name}": array for name, array in pack(summary).items()}
         return kept
 
     def numbers(self) -> Arrays:
+        """The cell's numbers, once no unit is missing."""
         return self._merge(self)
 
     def whole(self, seed: int) -> Summary:

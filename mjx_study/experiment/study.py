@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Hashable, Mapping, Sized
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import jax
 import numpy as np
@@ -32,6 +32,8 @@ from mjx_study.tasks.task import Recipe, Task
 
 Result = TypeVar("Result")
 Arrays = dict[str, np.ndarray]
+SAVE_SECONDS: Final = 20.0
+"""Seconds between checkpoints of a cell."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,8 +136,6 @@ class StudyPlan:
         shared = optimizers.pop() if len(optimizers) == 1 else None
         return self.config.resolved() | named | {"iterations": self.iterations, "optimizer": shared}
 
-    @property
-    def contents(self) -> dict[str, str]:
     @cached_property
     def coordinates(self) -> list[dict[str, Any]]:
         """Exact coordinates of every cell on the study's axes."""
@@ -157,6 +157,8 @@ class StudyPlan:
         axes = {name: list(dict.fromkeys(each[name] for each in self.coordinates)) for name in self.coordinates[0]}
         return axes | {name: sorted(axes[name]) for name in ("timestep", "sigma", "samples")}
 
+    @property
+    def contents(self) -> dict[str, str]:
         forms: dict[str, list[Task]] = {}
         for group in self.groups:
             forms.setdefault(group.name, []).append(group.task)
@@ -192,8 +194,6 @@ def estimators_of(plan: StudyPlan, cell: StudyCell) -> tuple[Estimator, ...]:
     return plan.chosen[key]
 
 
-class StudyError(ValueError):
-    """A folder holds no study, another study, or a damaged file."""
 def check_numbers(axes: Mapping[str, Sized], config: Mapping[str, Any]) -> None:
     """Raise ValueError for a study with a variable of more than `MOST_NUMBERS` numbers, given the axes of all cells."""
     inner = config["seeds"] * len(config["estimators"]) * max(config["iterations"] or 1, config["points"] or 1)
@@ -204,6 +204,8 @@ def check_numbers(axes: Mapping[str, Sized], config: Mapping[str, Any]) -> None:
         )
 
 
+class StudyError(ValueError):
+    """A folder holds no study, another study, or a damaged file."""
 
 
 def reason_of(error: Exception) -> str:
@@ -237,39 +239,13 @@ class Checkpoint:
             raise StudyError(message) from error
 
 
-class Work:
-    """The work units of a cell and what the finished ones found; here a single unit, which finds all numbers."""
-
-    units = 1
-
-    def __init__(self) -> None:
-        self._numbers: Arrays | None = None
-
-    @property
-    def missing(self) -> list[int]:
-        """Unfinished units, in order."""
-        return [0] if self._numbers is None else []
-
-    def add(self, unit: int, arrays: Arrays) -> None:
-        """Add what a unit found."""
-        self._numbers = arrays
-
-    def arrays(self) -> Arrays:
-        """The checkpoint of several units."""
-        return {}
-
-    def numbers(self) -> Arrays:
-        """The cell's numbers, once no unit is missing."""
-        assert self._numbers is not None
-        return self._numbers
-
-
 class Computation(ABC):
     """Computes work units of a plan's cells, and keeps compiled programs between them."""
 
-    def begin(self, cell: StudyCell, checkpoint: Checkpoint) -> Work:
-        """The work units of a cell, less those that its checkpoint holds; StudyError if that does not fit."""
-        return Work()
+    def begin(self, cell: StudyCell, checkpoint: Checkpoint) -> Any:
+        """The `merged_samples.Blocks` of a cell, with those that its checkpoint holds; StudyError if that does not fit.
+        None for a single work unit, which finds all numbers."""
+        return None
 
     @abstractmethod
     def compute(self, cell: StudyCell, unit: int, checkpoint: Checkpoint) -> Future[Arrays]:

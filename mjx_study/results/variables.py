@@ -170,8 +170,6 @@ MARKS: Final = """\
 After the arrows: the same without the sampling noise of batch and reference, ± one standard error. Errors below two
 of them are not detected; a mean is called biased from p = 0.001, 3.3 of them if means are normal. < and >: bounds
 of two standard errors where nothing is left; -: noise explains all of it."""
-MEASURED: Final = ("seconds", "seconds_per_sample")
-"""Measured times, the only variables that differ from run to run."""
 
 
 def with_metrics(variables: Mapping[str, Variable], names: Iterable[str]) -> dict[str, Variable]:

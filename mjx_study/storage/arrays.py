@@ -11,17 +11,18 @@ import json
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from mjx_study.disk import read_whole, write_whole
 from mjx_study.experiment.study import StudyError, reason_of
+from mjx_study.limits import MOST_GIB
 from mjx_study.options.files import read_npy, validated
 from mjx_study.results.kind import StudyResults, find_kind
 from mjx_study.results.variables import ONSETS, with_metrics
 
-MOST_CELL_BYTES: Final = 2**31  # maximum size of a cell's file [bytes]
+MOST_CELL_BYTES: Final = int(MOST_GIB * 2**30)  # maximum size of a cell's file [bytes]
 MOST_MEMBERS: Final = 1_000_000
 """Maximum number of arrays in a file."""
 MEMBER: Final = b"PK\x01\x02"  # signature of an entry in a zip file's directory
@@ -42,7 +43,7 @@ class CellFile:
     def write(self, arrays: Mapping[str, np.ndarray], versions: Mapping[str, str]) -> None:
         kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
         digest = np.array([digest_of_arrays(kept), self.study, self.cell])
-        write_whole(self.path, lambda file: write_arrays(file, {"digest": digest} | kept))
+        write_whole(self.path, lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
 
     def read(
         self, check: Callable[[dict[str, np.ndarray]], None] | None = None
@@ -80,12 +81,8 @@ def digest_of_arrays(arrays: Mapping[str, np.ndarray]) -> str:
     return sha.hexdigest()
 
 
-def write_arrays(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
-    np.savez(file, **arrays)  # type: ignore[arg-type]
-
-
 def read_arrays(content: bytes) -> dict[str, np.ndarray]:
-    """Read what `write_arrays` wrote, as read-only arrays; ValueError or an error of zipfile for anything else."""
+    """Read what `numpy.savez` wrote, as read-only arrays; ValueError or an error of zipfile for anything else."""
     if content.count(MEMBER) > MOST_MEMBERS:
         raise ValueError(f"it holds more than {MOST_MEMBERS} arrays")
     found: dict[str, np.ndarray] = {}

@@ -44,6 +44,7 @@ class Store:
         self.folder, self.document = folder, document
         self._versions: dict[str, str] = document.get("versions", {})
         self._study = digest_of_json(_identity(document))
+        self._before: dict[int, dict[str, str]] = {}  # versions that computed the checkpoints of cells
 
     @property
     def chunk_size(self) -> int:
@@ -169,13 +170,15 @@ class Store:
             with suppress(OSError):
                 self.file(index, part=True).write(arrays, self._authors(index))
 
-        return Checkpoint(self.read_part(index), save, report, str(self.part_path(index)))
+        kept: dict[str, np.ndarray] = {}
+        if os.path.lexists(self.part_path(index)):
+            kept, self._before[index] = self.read_with_versions(index, part=True)
+        return Checkpoint(kept, save, report, str(self.part_path(index)))
 
     def _authors(self, index: int) -> dict[str, str]:
         """Versions that computed a cell, including those of its checkpoint."""
-        if not os.path.lexists(self.part_path(index)):
+        if (before := self._before.get(index)) is None:
             return self._versions
-        before = self.read_with_versions(index, part=True)[1]
         names = dict.fromkeys([*before, *self._versions])
         both = {name: [*before.get(name, "none").split(" and "), self._versions.get(name, "none")] for name in names}
         return {name: " and ".join(dict.fromkeys(each)) for name, each in both.items()}
