@@ -1,5 +1,6 @@
 """Identity by content: what changes a number changes a digest, names and places do not; versions are told."""
 
+import copy
 import dataclasses
 import json
 import re
@@ -59,12 +60,14 @@ def test_a_model_counts_by_what_it_simulates(tmp_path: Path) -> None:
     model = scene.model.replace(body_mass=2 * scene.model.body_mass)
     moved = base.replace(scene=dataclasses.replace(scene, model=model))
     assert changed(base, moved) == {"model of it"}
-    tiny = 1e-11 * scene.model.body_inertia  # of a sphere of 2 mm, in kg m2
-    small, doubled = (
-        base.replace(scene=dataclasses.replace(scene, model=scene.model.replace(body_inertia=each)))
-        for each in (tiny, 2 * tiny)
+    small = 1e-11 * model.body_inertia  # of a sphere of 2 mm, in kg m2
+    host = copy.deepcopy(scene.host)
+    host.body_inertia[:] = small
+    tiny, doubled = (
+        base.replace(scene=dataclasses.replace(scene, host=host, model=model.replace(body_inertia=each)))
+        for each in (small, 2 * small)
     )
-    assert changed(small, doubled) == {"model of it"}
+    assert changed(tiny, doubled) == {"model of it"}
 
 
 def test_every_part_of_a_task_counts() -> None:
