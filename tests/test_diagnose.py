@@ -225,6 +225,12 @@ def test_when_the_onset_term_cannot_be_trusted(
     assert any(expected in text for text in texts) if expected else len(texts) == 1
 
 
+def test_contacts_that_all_lack_a_term_have_neither_a_first_step_nor_a_strength(found: Diagnosis) -> None:
+    none = found.onsets | {"onset_spread": math.nan, "onset_strength": math.nan}
+    told = "\n".join(page_lines(dataclasses.replace(found, onsets=none)))
+    assert "contacts and limits that begin" in told and "nan" not in told
+
+
 def test_biases_without_the_usual_explanation(found: Diagnosis) -> None:
     off = {"bias": 2 * found.norm, "off": 2 * found.norm, "off_error": 0.3 * found.norm}
     left = advised(found, estimators=with_estimator(found, "fobg_onset", verdict="biased", **off))
