@@ -75,11 +75,11 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     modes = float(np.max(np.abs(slopes - directions @ gradient))) / scale
     truth = take_differences(programs.costs(cell.contact, moves(directions))[:, None])
     error = np.abs(directions @ gradient - truth.value[0])
-    apart = error > DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0]
+    apart = ~(error <= DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0])  # True where NaN
     kinks = truth.kink[0] & (error <= truth.gap[0])
-    excused = ["jump" if truth.jump[0, at] else "kink" if kinks[at] else None for at in np.flatnonzero(apart)]
+    excuses = np.select([np.isnan(error), truth.jump[0], kinks], ["unresolved", "jump", "kink"], "")[apart].tolist()
     finite = bool(np.all(np.isfinite(gradient)))
-    verdict = cost_verdict(finite=finite, modes=modes, residual=float(residual), excused=excused)
+    verdict = cost_verdict(finite=finite, modes=modes, residual=float(residual), excuses=excuses)
     closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
     errors = (modes, float(error.max() / scale), float(truth.gap.max() / scale), closed_form, float(residual))
     check = CostCheck(cell.family, cell.stiffness_or_zero, norm, *errors, verdict)
@@ -103,15 +103,15 @@ def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
     return findings
 
 
-def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[str | None]) -> str:
-    """Return the verdict on a gradient; `excused` is kink, jump or None for each direction in which it is off."""
+def cost_verdict(*, finite: bool, modes: float, residual: float, excuses: Sequence[str]) -> str:
+    """Return the verdict on a gradient, from the excuse for each direction in which it is off, empty for none."""
     if not finite:
         return "nan"
     if not residual <= DIFFERENCE_TOLERANCE:
         return "unconverged"
-    if not modes <= MODES_TOLERANCE or None in excused:
+    if not modes <= MODES_TOLERANCE or "" in excuses:
         return "wrong"
-    return worst_verdict([name for name in excused if name])
+    return worst_verdict(excuses)
 
 
 def _against_closed_form(task: Task, cell: ContactPoint, gradient: np.ndarray, key: Any) -> float | None:

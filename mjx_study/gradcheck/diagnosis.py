@@ -66,7 +66,7 @@ def judge(
     scale = row_scales(layout, jacobian, truth)
     allowed = TOLERANCE * scale + 3 * truth.uncertainty
     error = np.abs(jacobian - truth.value)
-    right = error <= allowed  # False where NaN
+    right = error <= allowed  # False where one is NaN
     codes = np.full(jacobian.shape, WRONG)
     # A derivative between or near the two slopes is as good as any; zero outside of them is not.
     within = error <= np.maximum(truth.gap, allowed)
@@ -74,6 +74,7 @@ def judge(
     codes[(jacobian == 0) & ~right] = ZERO
     if converged is not None:
         codes[~right & (np.abs(converged - truth.value) <= allowed)] = UNCONVERGED
+    codes[np.isnan(truth.value)] = UNRESOLVED
     if starved:
         codes[:] = UNCONVERGED
     codes[right] = RIGHT
@@ -99,7 +100,7 @@ def row_scales(
     scale = np.empty(jacobian.shape)
     size = np.where(np.isfinite(jacobian), np.abs(jacobian), 0.0)
     if truth is not None:
-        size = np.maximum(size, np.abs(truth.value))
+        size = np.fmax(size, np.abs(truth.value))  # without those that are NaN
     kinds = np.array([output.block for output in layout.outputs])
     for block in layout.blocks():
         columns = layout.columns(block)

@@ -32,7 +32,8 @@ class Differences:
     """Jacobian by finite differences, with its uncertainty, entry by entry.
 
     Attributes:
-        value: derivative by central differences if there is one, else the mean of the one-sided slopes.
+        value: derivative by central differences if there is one, else the mean of the one-sided slopes; NaN where too
+            few outputs are finite.
         gap: disagreement of the one-sided slopes at the smallest step not dominated by rounding; at an odd jump, the
             slope of the central difference.
         kink: entries whose one-sided slopes disagree at any step size.
@@ -67,7 +68,11 @@ def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "mo
 def take_differences(
     outputs: Float[np.ndarray, "moves outputs"], noise_floor: Float[np.ndarray, " outputs"] | float = 0.0
 ) -> Differences:
-    """Differences of the outputs at `moves`, one row per change; the noise floor is in addition to `ROUNDING`."""
+    """Differences of the outputs at `moves`, one row per change; the noise floor is in addition to `ROUNDING`.
+
+    Long steps may leave the domain of a function: sizes at which outputs are not finite are not used.
+    """
+    outputs = np.where(np.isfinite(outputs), outputs, np.nan)
     sizes = np.array(SIZES)[:, None, None]
     here, rest = outputs[0], outputs[1:].reshape(2, len(SIZES), -1, outputs.shape[1])
     above, below = rest
@@ -77,7 +82,7 @@ def take_differences(
     change = np.abs(np.diff(better, axis=0))
     spread = np.maximum(change[1:], change[:-1])  # agreement of three adjacent sizes
     noise = ROUNDING * np.maximum(np.abs(here), 1e-2) + noise_floor
-    spread = spread + noise / sizes[2 : 2 + len(spread)]
+    spread = np.where(np.isnan(spread), np.inf, spread + noise / sizes[2 : 2 + len(spread)])
     best = np.argmin(spread, axis=0)[None]
     value = np.take_along_axis(better[1:-1], best, axis=0)[0]
     uncertainty = np.take_along_axis(spread, best, axis=0)[0]
@@ -93,6 +98,7 @@ def take_differences(
     nearby = (power < SMOOTH) & ~here_too
     value = np.where(nearby, central[-2], value)
     uncertainty = np.where(nearby, np.abs(central[-1] - central[-2]) + noise / SIZES[-1], uncertainty)
+    value = np.where(np.isfinite(uncertainty), value, np.nan)
     return Differences(value.T, uncertainty.T, gap.T, kink.T, jump.T, nearby.T)
 
 

@@ -121,7 +121,7 @@ class CostCheck:
         closed_form: distance from the hand-written gradient of the reference system, which measures the distance
             between the two models of the system. None without a reference.
         residual: largest relative solver residual of the rollout.
-        verdict: right, kink, jump, unconverged, nan or wrong.
+        verdict: right, unresolved, kink, jump, unconverged, nan or wrong.
     """
 
     contact: str

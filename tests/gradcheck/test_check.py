@@ -2,18 +2,22 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mjx_study import cli
 from mjx_study.gradcheck import Finding, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.gradcheck.causes import ROUNDING_DECIDES
+from mjx_study.gradcheck.cost import CostPrograms, check_cost
 from mjx_study.simulation import dynamics
 from mjx_study.simulation.scene import load_scene
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import ContactPoint
 from tests.scenes import plain_warm_start, scene_of
 
 CONVERGED = 'iterations="100" ls_iterations="50"'
@@ -60,6 +64,29 @@ def test_a_gradient_that_is_no_number_is_told_from_a_wrong_step() -> None:
     assert not report.passed and report.failure == "nan"
     assert report.lines()[-1].startswith("NOT RIGHT: the derivatives of steps are right, but")
     assert "cost or policy" in report.reason
+
+
+@pytest.mark.parametrize(
+    ("slope", "domain", "verdict"), [(50.0, 0.0, "right"), (0.0, 0.0, "wrong"), (50.0, 1e-4, "unresolved")]
+)
+def test_a_cost_is_judged_where_it_is_finite(slope: float, domain: float, verdict: str) -> None:
+    """A square root near the end of its domain, which the longest differences leave."""
+    none = np.zeros((0, 1))
+
+    class Root(CostPrograms):
+        def __init__(self) -> None:
+            self.task = make_task("pusher", horizon=1).replace(theta=jnp.array([1e-4]), reference=None)
+            self.key = jax.random.key(0)
+
+        def gradient(self, contact: Any, directions: np.ndarray) -> Any:
+            states = SimpleNamespace(qpos=none, qvel=none, act=none, warmstart=none)
+            return (states, none, 0.0, None), np.array([slope]), directions[:, 0] * slope
+
+        def costs(self, contact: Any, changes: np.ndarray) -> np.ndarray:
+            theta = 1e-4 + changes[:, 0]
+            return np.where((theta > domain) | (changes[:, 0] == 0), np.sqrt(np.maximum(theta, 0)), np.nan)
+
+    assert check_cost(Root(), ContactPoint("mjcf", None, None), seed=0)[0].verdict == verdict
 
 
 def test_a_wrong_derivative_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,6 +76,9 @@ NAN, INF = float("nan"), float("inf")
         (0.0, "right", {"value": 0.0, "uncertainty": 0.2}),
         (0.0, "zero", {}),
         (0.0, "right", {"value": 0.0}),
+        # differences that are not a number contradict nothing
+        (0.5, "unresolved", {"value": NAN}),
+        (0.0, "unresolved", {"value": NAN}),
         # nothing excuses a derivative that is not a number
         (NAN, "nan", {}),
         (INF, "nan", {}),

@@ -53,6 +53,15 @@ def test_many_outputs_and_columns_keep_their_places() -> None:
     np.testing.assert_allclose(found.value, matrix, rtol=1e-9)
 
 
+@pytest.mark.parametrize("beyond", [np.nan, np.inf])
+def test_long_steps_may_leave_the_domain(beyond: float) -> None:
+    found = read(lambda x: np.where(x > -1e-4, np.sqrt(np.maximum(x + 1e-4, 0)), beyond))
+    assert found.value[0, 0] == pytest.approx(50, rel=1e-6) and found.uncertainty[0, 0] < 1e-4
+    assert not found.rough[0, 0]
+    for edge in (0.0, 4e-7):  # no or too few steps stay within
+        assert np.isnan(read(lambda x, edge=edge: np.where(x > -edge, x, beyond)).value[0, 0])
+
+
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e3])
 def test_a_kink(scale: float) -> None:
     found = read(lambda x: scale * (np.abs(x) + 0.5 * x), noise=1e-16 * scale)
