@@ -11,7 +11,7 @@ from estimators.noise import split_sample_key
 from mjx_study.gradcheck.diagnosis import worst_verdict
 from mjx_study.gradcheck.differences import moves, take_differences
 from mjx_study.gradcheck.programs import Compiler, compiled
-from mjx_study.gradcheck.report import CostCheck, Entry, Finding
+from mjx_study.gradcheck.report import WHOLE, CostCheck, Entry, Finding
 from mjx_study.objective import rollout_cost
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.engine import HostState
@@ -97,7 +97,7 @@ def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
         if not distance <= CLOSED_FORM_TOLERANCE:
             text = f"the gradient is {distance:.1e} of its norm from the closed form's"
             text += f", farther than at {softest:g} N/m ({nearest:.1e})" if grows else ""
-            entry = Entry("the whole rollout", 0, 0.0, "", distance, None)
+            entry = Entry(WHOLE, 0, 0.0, "", distance, None)
             label = f"{contact}, K = {stiffness:g} N/m"
             findings.append(Finding(label, "project", "wrong" if grows else "apart", (), text, (entry,)))
     return findings

@@ -17,6 +17,7 @@ import numpy as np
 from mjx_study.gradcheck.coordinates import joints_above
 from mjx_study.simulation.contact_pair import NO_FRICTION, ContactPair, contact_pairs
 from mjx_study.simulation.scene import Scene
+from mjx_study.table import plural
 
 ZONES: Final = ("push", "stick", "slide", "separate")
 """Contact zones: push is frictionless; stick and slide have friction; separate is within the margin, without force."""
@@ -55,7 +56,7 @@ class Coverage:
             f"{part} out of reach of {'the only pair' if pairs == 1 else f'all {pairs} pairs'} of geoms"
             for part, pairs in self.unreachable.items()
         ]
-        return f"of {self.states} states, {'; '.join(parts)}" if parts else ""
+        return f"of {plural(self.states, 'state')}, {'; '.join(parts)}" if parts else ""
 
 
 def count_coverage(
@@ -104,7 +105,7 @@ def possible(scene: Scene, host: mujoco.MjModel) -> tuple[frozenset[str], dict[s
     parts, unreachable = contact_parts(host) if len(rows.contact.dim) else (set(), {})
     parts |= {"limit"} if rows.nl else set()
     parts |= {"friction loss", "held", "slipping"} if rows.nf else set()
-    parts |= {"equality"} if rows.ne else set()
+    parts |= {"equality"} if rows.ne and host.eq_active0.any() else set()
     return frozenset(parts), unreachable
 
 

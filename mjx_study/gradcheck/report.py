@@ -16,6 +16,8 @@ PLACES: Final = {
     "from pose": "a fall from a random pose, likewise",
 }
 """What the names of states mean that the rollout does not reach."""
+WHOLE: Final = "the whole rollout"
+"""Place of a finding on the gradient of a whole cost."""
 OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "engine_mismatch": "the C engine"}
 """Source of the compared number, if not finite differences."""
 HEADINGS: Final = {
@@ -81,6 +83,11 @@ class Finding:
     def fails(self) -> bool:
         """Whether it fails the check, because the project's derivative is at fault."""
         return self.who == "project" and self.verdict in FAILURES
+
+    @property
+    def of_whole(self) -> bool:
+        """Whether it is about the gradient of a whole cost, not about a step."""
+        return self.entries[0].state == WHOLE
 
     def line(self) -> str:
         example, states = self.entries[0], len({entry.state for entry in self.entries})
@@ -217,7 +224,10 @@ class GradcheckReport:
     @property
     def reason(self) -> str:
         """What is wrong; empty if nothing is."""
-        if any(each.fails for each in self.findings) or any(check.verdict in FAILURES for check in self.steps):
+        failing = [each for each in self.findings if each.fails]
+        if failing and all(each.of_whole for each in failing):
+            return failing[0].cause
+        if failing or any(check.verdict in FAILURES for check in self.steps):
             return MEANING[self.failure]
         what = OF_WHOLE.get(self.failure, "not its slope: look at the derivatives of cost and policy")
         return (
@@ -287,7 +297,7 @@ class GradcheckReport:
                 ]
         if len(shown) < len(alike):
             lines.append(f"and {len(alike) - len(shown)} more (--details lists all)")
-        verdicts = dict.fromkeys(finding.verdict for finding in self.findings)
+        verdicts = dict.fromkeys(each.verdict for each in self.findings if not (each.of_whole and each.fails))
         lines += [f"{verdict}: {MEANING[verdict]}" for verdict in verdicts if verdict in MEANING]
         text = "\n".join(lines)
         lines += [f"{name}: {meaning}" for name, meaning in PLACES.items() if name in text]

@@ -20,7 +20,7 @@ SPEED: Final = 0.1
 FASTER: Final = (1.0, 5.0)  # standard deviations in rollouts that search for parts the first did not reach
 PUSHES: Final = 10  # number of times that new velocities and controls are drawn in such a rollout
 CONTROL: Final = 0.3
-"""Standard deviation of sampled controls, relative to half their range; absolute for unlimited controls."""
+"""Largest deviation of sampled controls, relative to half their range; absolute for unlimited controls."""
 POSES: Final = 30  # number of random poses tried for parts that no rollout reached
 FALL: Final = 50  # number of steps of the rollout from each pose
 MAX_EXCESS: Final = 0.01  # largest excess of a pose beyond a limit, relative to the range
@@ -144,11 +144,12 @@ def _stirred(
     """Return the state with new random velocities, controls and activations."""
     low, high = host.actuator_ctrlrange.T
     limited = host.actuator_ctrllimited.astype(bool)
-    half, centre = np.where(limited, (high - low) / 2, 1.0), np.where(limited, (high + low) / 2, 0.0)
+    spread = control * np.where(limited, (high - low) / 2, 1.0)
+    middle = np.where(limited, np.clip(state.control, low + spread, high - spread), state.control)
     return dataclasses.replace(
         state,
         qvel=state.qvel + speed * random.normal(size=host.nv),
-        control=state.control + centre + control * half * random.uniform(-1, 1, size=host.nu),
+        control=middle + spread * random.uniform(-1, 1, size=host.nu),
         act=state.act + 0.1 * np.abs(random.normal(size=host.na)),
     )
 

@@ -48,7 +48,7 @@ def test_unreachable_parts_are_reported_and_not_missing() -> None:
     )
     lines = report(step).lines()
     assert (
-        "of 1 states, contact in 1 (stick 1, separate 0); limit in 1; slide out of reach of all 2 pairs of geoms"
+        "of 1 state, contact in 1 (stick 1, separate 0); limit in 1; slide out of reach of all 2 pairs of geoms"
         in lines
     )
     assert lines[-1] == "every derivative that exists is right" and not report(step).unexercised
@@ -85,3 +85,6 @@ def test_a_closed_form_is_a_judge() -> None:
     assert stiff.fails and "farther than at 10 N/m" in stiff.cause
     (both,) = judge_closed_forms([closed_form(10, 1e-6), closed_form(1000, 0.5)])
     assert both.fails
+    told = report(STEP, findings=(both,))
+    assert not told.passed and not any("that of the step" in line for line in told.lines())
+    assert told.lines()[-1] == f"NOT RIGHT: {both.cause}"

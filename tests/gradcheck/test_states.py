@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study.gradcheck.coverage import Coverage, Reach, contact_parts
-from mjx_study.gradcheck.states import Sample, states_of
+from mjx_study.gradcheck.coverage import Coverage, Reach, contact_parts, possible
+from mjx_study.gradcheck.states import CONTROL, Sample, states_of
 from mjx_study.simulation.contact_pair import contact_pairs
 from mjx_study.simulation.engine import host_state
 from mjx_study.simulation.scene import Scene, load_scene
@@ -33,6 +33,31 @@ def test_parts_that_a_slow_rollout_misses_are_searched(cone: str) -> None:
     for part in ("stick", "slide", "limit", "held", "slipping"):
         assert found.counts[part] >= 1, found
     assert samples[0].label == "start, at rest" and any("pushed" in s.label or "pose" in s.label for s in samples)
+
+
+@pytest.mark.parametrize(("low", "high", "key"), [(0, 20, 10), (0, 20, 0), (-1, 1, 0), (-3, -1, -1.5)])
+def test_controls_stay_within_their_range(low: float, high: float, key: float) -> None:
+    """Beyond it MuJoCo clips them, and every derivative is zero."""
+    xml = f"""<mujoco><worldbody>{FLOOR + PUCK + ARM}</worldbody>
+    <actuator><motor joint="arm" ctrllimited="true" ctrlrange="{low} {high}"/></actuator>
+    <keyframe><key ctrl="{key}"/></keyframe></mujoco>"""
+    samples, _ = states_of(scene_of(xml), None, 12, 100, 0)
+    slow, pushed = (
+        np.array([s.state.control[0] for s in samples[1:] if ("," in s.label) == elsewhere])
+        for elsewhere in (False, True)
+    )
+    half, spread = (high - low) / 2, CONTROL * (high - low) / 2
+    assert len(slow) and np.all(np.abs(slow - np.clip(key, low + spread, high - spread)) <= spread)
+    assert len(pushed) and np.all(np.abs(pushed - low - half) <= half)
+
+
+def test_an_equality_that_is_off_need_not_be_exercised() -> None:
+    def parts(active: str) -> frozenset[str]:
+        equality = f'<equality><joint joint1="arm" active="{active}"/></equality>'
+        found = scene_of(f"<mujoco><worldbody>{ARM}</worldbody>{equality}</mujoco>")
+        return possible(found, found.host)[0]
+
+    assert "equality" in parts("true") and "equality" not in parts("false")
 
 
 def test_an_unreached_part_is_reported() -> None:
