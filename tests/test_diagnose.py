@@ -18,12 +18,13 @@ from mjx_study.diagnose.advice import advise
 from mjx_study.diagnose.means import along_means
 from mjx_study.diagnose.measurement import ESTIMATORS, Measured, Measurement, affordable, chunk_of, more_samples
 from mjx_study.diagnose.page import document_of, page_lines
-from mjx_study.diagnose.run import Diagnosis, diagnose_task
-from mjx_study.diagnose.setting import setting_of
+from mjx_study.diagnose.run import Diagnosis, diagnose_task, plan_diagnosis
+from mjx_study.diagnose.setting import setting_of, touches_of
 from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.gradcheck import Finding
 from mjx_study.objective import Simulator
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.mjcf import mjcf_task
 from tests.estimators import objectives
 
@@ -46,8 +47,12 @@ def ball(folder: Path, solimp: str = "0.9 0.95 0.001 0.5 2") -> str:
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Diagnosis:
     """The ball, on its way up again."""
-    name = ball(tmp_path_factory.mktemp("ball"))
-    return diagnose_task(name, make_task(name, horizon=65).replace(sigma=0.05), samples=500)
+    return diagnosed(ball(tmp_path_factory.mktemp("ball")), 65, 500, sigma=0.05)
+
+
+def diagnosed(name: str, horizon: int, samples: int, options: str = "", **changes: Any) -> Diagnosis:
+    plan = plan_diagnosis(name, make_task(name, horizon=horizon).replace(**changes), samples=samples)
+    return diagnose_task(name, plan, samples=samples, options=options)
 
 
 def test_the_contact_in_closed_form(found: Diagnosis) -> None:
@@ -76,6 +81,14 @@ def test_the_bias_its_correction_and_the_best_estimator(found: Diagnosis) -> Non
     bias = abs(exact.first[0] - exact.slope[0])
     assert by_name["fobg"].bias == pytest.approx(bias, rel=0.3)  # one is over a path, the other at its middle
     assert found.derivatives.passed
+
+
+@pytest.mark.parametrize("solimp", ["0.9 0.95 0", "0 0 0.001"])
+def test_a_contact_of_any_impedance_is_described(solimp: str, tmp_path: Path) -> None:
+    """MuJoCo allows a rise without a width, and an impedance of 0, in place of which it uses its least."""
+    task = make_task(ball(tmp_path, solimp), horizon=65)
+    (touch,) = touches_of(task, single_contact(task)[0])
+    assert touch.travel is not None and touch.travel > 0 and math.isfinite(touch.travel + touch.jump)
 
 
 def advised(found: Diagnosis, **changes: Any) -> list[str]:
@@ -130,7 +143,7 @@ def test_other_parameters_and_what_is_written(tmp_path: Path, capsys: pytest.Cap
 def test_the_advised_impedance_avoids_the_bias(found: Diagnosis, tmp_path: Path) -> None:
     (text,) = (text for text in advised(found) if "solimp" in text)
     name = ball(tmp_path, text.partition('solimp="')[2].partition('"')[0])
-    smooth = diagnose_task(name, make_task(name, horizon=65).replace(sigma=0.05), samples=500)
+    smooth = diagnosed(name, 65, 500, sigma=0.05)
     assert {each.estimator: each.verdict for each in smooth.estimators}["fobg"] == "right"
     assert not [text for text in advised(smooth) if "biased" in text]
 
@@ -139,7 +152,7 @@ def test_the_advised_impedance_avoids_the_bias(found: Diagnosis, tmp_path: Path)
 @pytest.mark.parametrize("model", ["cart", "pendulum", "peg"])
 def test_the_commands_on_the_page_repeat_it(model: str, capsys: pytest.CaptureFixture[str]) -> None:
     name, horizon = str(HELD_OUT / f"{model}.xml"), 60
-    found = diagnose_task(name, make_task(name, horizon=horizon), samples=60, options=f" --horizon {horizon}")
+    found = diagnosed(name, horizon, 60, f" --horizon {horizon}")
     commands = commands_of(found)
     steps, means = (command for command in commands if command[0] == "gradcheck")
     batches = next(command for command in commands if command[0] == "compare" and "zobg" in "".join(command))
@@ -273,6 +286,16 @@ def test_without_a_significant_gradient_zeroth_order_is_advised_and_no_mean_judg
     assert taken(right) == "zobg" and taken(dataclasses.replace(right, variance=3.9)) == "fobg"
     off = dataclasses.replace(right, verdict="biased", off=3.0, off_error=0.2, bias=3.0)
     assert any("off by 3.00 ± 0.20 in the gradient's unit" in line for line in page_lines(among(off)))
+
+
+def test_a_page_without_finite_samples_or_variance_says_so(found: Diagnosis) -> None:
+    nothing = {"variance": math.nan, "lower": math.nan, "upper": math.nan, "norm": math.nan, "lost": found.samples}
+    assert f"the gradient is unknown: 0 of {found.samples} samples are finite" in page_lines(
+        dataclasses.replace(found, estimators=(planted(estimator="zobg", **nothing), planted(**nothing)))
+    )
+    wild = with_estimator(found, "fobg", variance=math.inf, lower=math.inf, upper=math.inf)
+    rows = [line.split()[:2] for line in page_lines(dataclasses.replace(found, estimators=wild))]
+    assert ["fobg", "inf"] in rows
 
 
 @pytest.mark.parametrize(

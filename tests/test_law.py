@@ -20,7 +20,7 @@ from mjx_study import cli
 from mjx_study.bench import run_bench
 from mjx_study.choices import FAMILIES
 from mjx_study.diagnose.page import document_of, page_lines
-from mjx_study.diagnose.run import diagnose_task
+from mjx_study.diagnose.run import diagnose_task, plan_diagnosis
 from mjx_study.execution.run import run_study
 from mjx_study.graph import scalars
 from mjx_study.graph.native import SWITCH
@@ -207,7 +207,7 @@ def test_a_timestep_may_be_a_number(most: int, monkeypatch: pytest.MonkeyPatch) 
 def test_diagnose_judges_means_under_every_law() -> None:
     """What begins, and how much its step varies, does not depend on the law: the ball flies freely until then."""
     for law, lead in (("hunt_crossley", 0.004), ("log_barrier", 0.002 + 0.95 * 0.04)):
-        found = diagnose_task(THROWN, thrown(), law, samples=60)
+        found = diagnose_task(THROWN, plan_diagnosis(THROWN, thrown(), law, samples=60), samples=60)
         document, page = document_of(found), "\n".join(page_lines(found))
         means = {each["estimator"]: each["mean"] for each in document["estimators"]}
         assert means == {"zobg": "unbiased", "fobg": "right", "aobg": "right"}

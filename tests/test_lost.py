@@ -12,9 +12,11 @@ import xarray as xr
 
 from mjx_study import cli
 from mjx_study.bench import check_bench
-from mjx_study.diagnose.run import diagnose_task
+from mjx_study.diagnose.measurement import measure
+from mjx_study.diagnose.run import plan_diagnosis
 from mjx_study.execution.lost import all_lost, first_nonfinite
 from mjx_study.experiment.plan import plan_study
+from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import lost_samples
 from mjx_study.simulation.dynamics import State, initial_state
@@ -81,7 +83,7 @@ def test_what_cannot_be_studied_is_refused_before_it_is_compiled(name: str) -> N
         check_soundness,
         lambda task: plan_study(StudyConfig(tasks=(task,), contact=("mjcf",))),
         lambda task: check_bench(task, 10),
-        lambda task: diagnose_task("falling", task),
+        lambda task: plan_diagnosis("falling", task),
     ):
         with pytest.raises(ValueError, match=message):
             plan(make())
@@ -116,6 +118,14 @@ def test_where_nothing_was_computed_or_descents_diverge_no_sample_is_blamed() ->
     diverged = xr.Dataset({"final_cost": nan, "start_cost": 2.0})
     assert str(all_lost(descents, diverged)).endswith("although that at the start is: use a lower --learning-rate")
     assert str(all_lost(descents, diverged.assign(start_cost=np.nan))).startswith("all samples are lost")
+
+
+@pytest.mark.slow
+def test_the_mean_cost_is_that_of_finite_samples() -> None:
+    """About half of the pushes are in the direction in which the cost is infinite."""
+    task = falling(final_cost=lambda state: jnp.where(state.qpos[1] > 0, jnp.inf, height(state)))
+    found = measure(Simulator(task, chunk_size=8), None, samples=8)
+    assert 0 < found.lost < found.samples and found.cost == pytest.approx(9.81 * 0.01**2 * 20 * 21 / 2)
 
 
 def test_the_first_nonfinite_quantity_has_a_name() -> None:

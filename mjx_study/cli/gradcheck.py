@@ -8,7 +8,7 @@ from mjx_study.cli.options import configure_process, given_options, task_at_thet
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import MEANS
 from mjx_study.options.configuration import OPTIONS, REQUIRED_OPTIONS
-from mjx_study.options.option import Option, OptionError, reject_unused
+from mjx_study.options.option import Option, OptionError, check_span, reject_unused
 from mjx_study.options.parser import Parser
 from mjx_study.table import explain
 
@@ -48,7 +48,7 @@ MEAN_OPTIONS = {
         dataclasses.replace(OPTIONS["estimators"], default=("zobg", "fobg")),
         OPTIONS["onset"],
         dataclasses.replace(
-            OPTIONS["samples"], many=False, interval="[1, 1e7]", default=1000, line="samples at each node of the path"
+            OPTIONS["samples"], many=False, interval="[2, 1e7]", default=1000, line="samples at each node of the path"
         ),
         dataclasses.replace(OPTIONS["sigma"], many=False),
         dataclasses.replace(OPTIONS["span"], line="range of the path", unset="two sigma about theta"),
@@ -119,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
 def _run_mean(options: argparse.Namespace) -> int:
     from mjx_study.diagnose.means import ALONG_MEANS, check_mean, lines_of, path_of
     from mjx_study.diagnose.setting import setting_of
-    from mjx_study.experiment.resolution import make_estimators, reads_onset, reject_unread
+    from mjx_study.experiment.resolution import direction_of, make_estimators, reads_onset, reject_unread
     from mjx_study.gradcheck import plan_gradcheck
 
     chosen = {name: option.default for name, option in MEAN_OPTIONS.items()} | given_options(options, *MEAN_OPTIONS)
@@ -132,6 +132,9 @@ def _run_mean(options: argparse.Namespace) -> int:
         settings = {name: chosen[name] for name in REQUIRED_OPTIONS}
         found = make_estimators(names, settings | {"gamma": task.defaults.gamma}, task)
         reject_unread(names, given_options(options, *REQUIRED_OPTIONS))
+        check_span(chosen["span"])
+        if chosen["direction"] != ALONG_MEANS:
+            direction_of(chosen["direction"], task.policy.num_params, seed)
         reject_unused(
             given_options(options, "onset", "span"),
             (["onset"], onset == "none" or reads_onset(names, onset), "has no effect on these estimators: add fobg"),

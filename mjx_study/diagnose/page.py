@@ -166,6 +166,8 @@ def _unresolved(found: Diagnosis) -> str:
     """Say that the gradient is not significantly different from 0, and how to resolve it."""
     if not found.norm:
         return "the gradient is 0: no parameter affects the cost"
+    if not math.isfinite(found.norm):
+        return f"the gradient is unknown: {found.samples - found.lost} of {found.samples} samples are finite"
     needed = enough(found, (RESOLVED_SE * found.norm_error / found.norm) ** 2)
     other = "larger" if found.surest.estimator == "zobg" else "smaller"
     return (

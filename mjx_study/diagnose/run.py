@@ -5,11 +5,11 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from mjx_study.choices import is_file, takes_stiffness
+from mjx_study.choices import is_file
 from mjx_study.diagnose.measurement import SAMPLES, Measured, Measurement, chunk_of, estimators_of, measure
 from mjx_study.diagnose.setting import ContactSummary, RolloutSetting, events_of, lead_of, setting_of, touches_of
 from mjx_study.experiment.memory import check_memory
-from mjx_study.gradcheck import GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
+from mjx_study.gradcheck import GradcheckPlan, GradcheckReport, gradcheck
 from mjx_study.objective import Simulator
 from mjx_study.progress import Progress, silent
 from mjx_study.simulation.contact import has_mujoco_law
@@ -64,7 +64,7 @@ class Diagnosis(Measurement):
         """Format an error to two significant digits, or to one if its relative standard error is large."""
         digits = 1 if uncertainty > ONE_DIGIT_UNCERTAINTY else 2
         size = float(f"{self.shown(error):.{digits}g}")
-        decimals = digits - 1 - math.floor(math.log10(size)) if size > 0 else 0
+        decimals = digits - 1 - math.floor(math.log10(size)) if 0 < size < math.inf else 0
         text = f"{size:.{max(decimals, 0)}f}" if -6 < decimals < 6 else f"{size:g}"
         return f"{text}{' %' if self.resolved else ''}"
 
@@ -94,7 +94,7 @@ def enough(found: Measurement, factor: float) -> str:
     return f"--samples {samples.replace(',', '')} ({time} here)"
 
 
-def diagnose_task(
+def plan_diagnosis(
     subject: str,
     task: Task,
     family: str | None = None,
@@ -104,6 +104,29 @@ def diagnose_task(
     smoothing: float | None = None,
     samples: int | None = None,
     seed: int = 0,
+) -> GradcheckPlan:
+    """Plan the check of derivatives in one contact model, under which `diagnose_task` measures everything else, too.
+
+    Args:
+        subject: the model as named by the user; for a file, the gradient check covers single steps only.
+        family, stiffness, damping, smoothing: of the contact [N/m, N s/m, J]; None for those of a single run.
+        samples: as for `diagnose_task`.
+
+    Raises:
+        ValueError: the task cannot be simulated, there is no such contact model, or the batches do not fit in memory.
+    """
+    check_soundness(task)
+    cell, warnings = single_contact(task, family, stiffness, damping, smoothing)
+    check_memory(task, estimators_of(task, cell.contact), samples or SAMPLES)
+    # no gradient over theta depends on contact parameters
+    return GradcheckPlan(task, not is_file(subject), (cell,), warnings, STATES, seed, stock=False, parameters=False)
+
+
+def diagnose_task(
+    subject: str,
+    plan: GradcheckPlan,
+    *,
+    samples: int | None = None,
     theta: str = "",
     options: str = "",
     progress: Progress = silent,
@@ -111,28 +134,16 @@ def diagnose_task(
     """Measure everything under one contact model.
 
     Args:
-        subject: the model as named by the user; for a file, the gradient check covers single steps only.
-        family, stiffness, damping, smoothing: of the contact [N/m, N s/m, J]; None for those of a single run.
-        samples: samples per batch, and per node of the paths along which means are checked; None for `SAMPLES`, or
-            fewer or more as in `measure`.
+        subject: the model as named by the user.
+        plan: what `plan_diagnosis` returns.
+        samples: samples per batch, and per node of the paths along which means are checked, at least 2; None for
+            `SAMPLES`, or fewer or more as in `measure`.
         theta: name of the task's theta if it is not its own.
         options: contact options as command-line flags.
-
-    Raises:
-        ValueError: there is no such contact model, or the batches do not fit in memory.
     """
-    check_soundness(task)
-    cell, warnings = single_contact(task, family, stiffness, damping, smoothing)
-    check_memory(task, estimators_of(task, cell.contact), samples or SAMPLES)
+    task, (cell,), seed = plan.subject, plan.cells, plan.seed
     progress(0, 4, PARTS[0])
     touches = tuple(touches_of(task, cell))
-    common = {"seed": seed, "damping": damping, "smoothing": smoothing, "states": STATES}
-    if is_file(subject):
-        plan = plan_scene_gradcheck(task.scene, [cell.family], None, horizon=task.horizon, **common)
-    else:
-        stiffnesses = [cell.stiffness_or_zero] if takes_stiffness([cell.family]) else None
-        plan = plan_gradcheck(task, [cell.family], stiffnesses, **common)
-    plan = dataclasses.replace(plan, parameters=False)  # on which no gradient over theta depends
 
     def part(at: int) -> Progress:
         return lambda done, total, what: progress(at, 4, f"{PARTS[at]}: {what}") if what != "done" else None
@@ -154,6 +165,6 @@ def diagnose_task(
         lead=lead_of(task, cell),
         touches=touches,
         derivatives=derivatives,
-        warnings=tuple(warnings),
+        warnings=plan.warnings,
         options=options,
     )

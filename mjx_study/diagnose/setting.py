@@ -112,7 +112,7 @@ def lead_of(task: Task, cell: ContactPoint) -> float:
 
 def events_of(task: Task, cell: ContactPoint, samples: int, seed: int) -> dict[str, float]:
     """Contacts that begin in a batch with noise, and the standard deviation of the step at which the first does, from
-    its first `EVENTS` rollouts; those of `ONSETS` that do not need MuJoCo's law."""
+    up to `EVENTS` rollouts of their own; those of `ONSETS` that do not need MuJoCo's law."""
     keys = jax.random.split(jax.random.key(seed), min(EVENTS, samples))
     found = [[each.time for each in touches_of(task, cell, key, 1.0)] for key in keys]
     first = [min(times) / task.scene.timestep for times in found if times]
@@ -175,8 +175,8 @@ def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: floa
         distance=float(contact.dist),
         damping=timestep * b,
         stiffness=timestep**2 * k,
-        travel=timestep * speed / float(contact.solimp[2]),
+        travel=timestep * speed / max(float(contact.solimp[2]), mujoco.mjMINVAL),
         impedance=float(contact.solimp[0]),
-        jump=timestep * b * float(contact.solimp[0] / contact.solimp[1]),
+        jump=timestep * b * float(contact.solimp[0] / max(contact.solimp[1], mujoco.mjMINIMP)),
         stable=stable(solref.tolist(), timestep),
     )

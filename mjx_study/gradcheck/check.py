@@ -53,6 +53,14 @@ class GradcheckPlan:
     stock: bool
     parameters: bool = True
 
+    def __post_init__(self) -> None:
+        if self.subject.scene.template.qpos.dtype != jnp.float64:
+            raise ValueError("gradcheck compares with differences and needs float64, the default precision")
+        if self.subject.scene.host.nv == 0:
+            raise ValueError(f"{self.subject.scene.name} has no degree of freedom: there is nothing to differentiate")
+        if self.states < 1:
+            raise ValueError(f"states must be at least 1, got {self.states}")
+
 
 def plan_gradcheck(
     task: Task,
@@ -81,12 +89,6 @@ def plan_gradcheck(
     Raises:
         ValueError: unusable family or stiffness, too few states, or float32.
     """
-    if task.scene.template.qpos.dtype != jnp.float64:
-        raise ValueError("gradcheck compares with differences and needs float64, the default precision")
-    if task.scene.host.nv == 0:
-        raise ValueError(f"{task.scene.name} has no degree of freedom: there is nothing to differentiate")
-    if states < 1:
-        raise ValueError(f"states must be at least 1, got {states}")
     if families is None:
         families = ("mjcf",) if task.contact_pair is None else CONTACT
     if not families or (stiffnesses is not None and not stiffnesses):
@@ -120,13 +122,8 @@ def plan_scene_gradcheck(
         scene: the scene, in float64, with at least one degree of freedom.
         families: contact families; by default `mjcf`, or `mujoco` if a stiffness is given.
         stiffnesses: stiffnesses for families that take one [N/m].
-        seed: random seed of the states.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
-        damping: override of each family's damping [N s/m].
-        smoothing: override of the smoothing kappa of laws other than MuJoCo's [J].
         horizon: number of steps of the rollout from which states are taken.
-        states: number of states per contact model.
-        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as for `plan_gradcheck`, or a stiffness without a pair.

@@ -87,7 +87,7 @@ class Finding:
     @property
     def of_whole(self) -> bool:
         """Whether it is about the gradient of a whole cost, not about a step."""
-        return self.entries[0].state == WHOLE
+        return any(each.state == WHOLE for each in self.entries)
 
     def line(self) -> str:
         example, states = self.entries[0], len({entry.state for entry in self.entries})
