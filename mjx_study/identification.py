@@ -208,7 +208,7 @@ def identify(
         raise ValueError(unknown("derivatives of a fit", derivatives, DERIVATIVES))
     if wrong := [name for name, value in guess.items() if not 0 < value < np.inf]:
         raise ValueError(f"parameters are fitted by their logarithms, {', '.join(wrong)} must be positive and finite")
-    problem = _Problem(predict, observed, deviation, tuple(guess), np.random.default_rng(seed))
+    problem = _Problem(predict, observed, deviation, tuple(guess), seed)
     slopes = problem.exact if derivatives == "exact" else problem.smoothed
     point = np.log([float(value) for value in guess.values()])
     if derivatives == "none":
@@ -225,18 +225,21 @@ def identify(
 
 
 def profile(
-    predict: Predict, observed: Numbers, deviation: Numbers, fit: Identified, name: str, grid: Any
+    predict: Predict, observed: Numbers, deviation: Numbers, fit: Identified, name: str, grid: Any, **search: Any
 ) -> Float[np.ndarray, " points"]:
     """Profile of one parameter: the misfit at each of its values with all others fitted again, less that of the fit.
 
-    Values at which it is below 3.84 are a 95 % interval.
+    Values at which it is below 3.84 are a 95 % interval. `search` are options of `identify`, such as `derivatives`.
     """
     others = {key: value for key, value in fit.values.items() if key != name}
-    fits = [
-        identify(lambda values, at=at: predict({**values, name: at}), observed, deviation, others)
-        for at in jnp.asarray(grid, float)
-    ]
-    return np.array([each.misfit for each in fits]) - fit.misfit
+
+    def misfit(at: Array) -> float:
+        fixed = lambda values: predict({**values, name: at})  # noqa: E731
+        if others:
+            return identify(fixed, observed, deviation, others, **search).misfit
+        return _squares(_Problem(fixed, observed, deviation).residuals(np.zeros(0)))
+
+    return np.array([misfit(at) for at in jnp.asarray(grid, float)]) - fit.misfit
 
 
 def _squares(residuals: Float[np.ndarray, " n"]) -> float:
@@ -244,26 +247,32 @@ def _squares(residuals: Float[np.ndarray, " n"]) -> float:
     return total if np.isfinite(total) else np.inf
 
 
+def _in_deviations(numbers: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Numbers in standard deviations; 0 where these are inf, as the record left out may be NaN."""
+    return np.divide(numbers, deviation, out=np.zeros(numbers.shape), where=np.isfinite(deviation))
+
+
 class _Problem:
     """Residuals in standard deviations, and their derivatives over the logarithms of parameters."""
 
     def __init__(
-        self, predict: Predict, observed: Numbers, deviation: Numbers, names: tuple[str, ...], rng: np.random.Generator
+        self, predict: Predict, observed: Numbers, deviation: Numbers, names: tuple[str, ...] = (), seed: int = 0
     ) -> None:
         self.observed = np.asarray(observed, float)
         self.deviation = np.broadcast_to(np.asarray(deviation, float), self.observed.shape)
-        self.predictions, self._rng, self._predict = 0, rng, predict
+        self.predictions, self._rng, self._predict = 0, np.random.default_rng(seed), predict
         self._named = lambda point: {name: jnp.exp(point[index]) for index, name in enumerate(names)}
         self._slopes = jax.jacfwd(lambda point: predict(self._named(point)))
 
     def residuals(self, point: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
         self.predictions += 1
-        return ((np.asarray(self._predict(self._named(np.asarray(point)))) - self.observed) / self.deviation).ravel()
+        gap = np.asarray(self._predict(self._named(np.asarray(point)))) - self.observed
+        return _in_deviations(gap, self.deviation).ravel()
 
     def exact(self, point: Float[np.ndarray, " p"]) -> Float[np.ndarray, "n p"]:
         self.predictions += len(point)
         slopes = np.asarray(self._slopes(jnp.asarray(point)))
-        return (slopes / self.deviation[..., None]).reshape(-1, len(point))
+        return _in_deviations(slopes, self.deviation[..., None]).reshape(-1, len(point))
 
     def smoothed(self, point: Float[np.ndarray, " p"]) -> Float[np.ndarray, "n p"]:
         shifts = SPREAD * self._rng.standard_normal((2 * len(point), len(point)))

@@ -35,6 +35,29 @@ def test_a_decay(derivatives: str, tolerance: float) -> None:
     np.testing.assert_allclose(profile(decay, decay(DECAY) + noise, 0.01, fit, "rate", at), 4, rtol=0.1)
 
 
+@pytest.mark.parametrize("derivatives", ["exact", "smoothed", "none"])
+def test_what_is_left_out_need_not_be_a_number(derivatives: str) -> None:
+    """A missing record, and a prediction that there is no record of."""
+    records, deviation = np.array(decay(DECAY)), np.full(TIMES.size, 0.01)
+    records[3], deviation[[3, 5]] = np.nan, np.inf
+    guess = {"size": 1.0, "rate": 3.0}
+    fit = identify(lambda values: decay(values).at[5].set(np.nan), records, deviation, guess, derivatives=derivatives)
+    np.testing.assert_allclose(list(fit.values.values()), [2.0, 1.5], rtol=1e-2)
+    assert fit.converged and fit.size == 38
+
+
+def test_a_profile_of_the_only_parameter_and_one_without_derivatives() -> None:
+    def engine(values: Any) -> np.ndarray:
+        known = DECAY | values
+        return float(known["size"]) * np.exp(-float(known["rate"]) * TIMES)
+
+    for guess in ({"rate": 1.0}, {"size": 1.0, "rate": 1.0}):
+        fit = identify(engine, engine({}), 0.01, guess, derivatives="none")
+        at = fit.values["rate"] * np.exp(2 * fit.standard_errors["rate"] * np.array([-1, 1]))
+        found = profile(engine, engine({}), 0.01, fit, "rate", at, derivatives="none")
+        np.testing.assert_allclose(found, 4, rtol=0.1)
+
+
 def test_products_leave_their_factors_unknown() -> None:
     def product(values: Any) -> Any:
         return decay({"size": values["a"] * values["b"], "rate": values["rate"]})
