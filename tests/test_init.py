@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -79,9 +80,13 @@ PILE: Final = (
     )
     + "</worldbody></mujoco>"
 )
+INTEGRATOR: Final = PENDULUM.replace(
+    '<motor joint="swing"/></actuator>',
+    '<intvelocity joint="swing" kp="1" actrange="-1 1"/></actuator><keyframe><key act="0.5"/></keyframe>',
+)
 MODELS: Final = {
     "arm": ARM, "leg": LEG, "ball": BALL, "pendulum": PENDULUM, "limited": LIMITED, "wheel": WHEEL, "unnamed": UNNAMED,
-    "pile": PILE,
+    "pile": PILE, "integrator": INTEGRATOR,
 }  # fmt: skip
 
 
@@ -129,7 +134,7 @@ def test_every_model_gets_a_task(name: str, begin: Callable[..., Begun]) -> None
     assert (document["horizon"], document["sigma"]) == (task.horizon, task.sigma)
     assert task.defaults.recipe is not None and task.defaults.recipe.learning_rate > 0
     if task.contact_pair is None:
-        assert task.defaults.families == ("mjcf",) and name in ("pendulum", "limited", "wheel", "unnamed")
+        assert task.defaults.families == ("mjcf",) and name in ("pendulum", "limited", "wheel", "unnamed", "integrator")
     else:
         low, high = task.defaults.stiffnesses[0], task.defaults.stiffnesses[-1]
         assert len(set(task.defaults.stiffnesses)) == 4 and high >= 5 * low
@@ -196,6 +201,34 @@ def test_contacts_are_those_of_a_fall() -> None:
     assert found.load is not None and found.load.weight == pytest.approx(0.5 * 9.81)
     assert found.load.depth(found.load.stiffness(0.01)) == pytest.approx(0.01)
     assert found.horizon * 0.004 >= max(2 * 0.143 - 0.01, 0.5)
+
+
+def test_a_resting_contact_without_gravity_gets_a_task() -> None:
+    """Neither weight nor speed presses it."""
+    ball = '<body pos="{} 0 0"><joint name="{}" type="slide" axis="1 0 0"/><geom name="{}" size=".1" mass="1"/></body>'
+    balls = ball.format(0, "x", "one") + ball.format(0.199, "y", "two")
+    found = proposed(f"""<mujoco><option gravity="0 0 0"/><worldbody>{balls}</worldbody>
+      <actuator><motor joint="y"/></actuator></mujoco>""")
+    assert found.pair == ("one", "two") and found.load is not None and found.load.stiffness(0.01) == 0
+    assert found.stiffnesses[-1] == pytest.approx(10 * found.stiffnesses[0], rel=0.1)
+
+
+def test_depths_are_those_within_the_horizon() -> None:
+    """A heavy ball lands on the one that is on the floor after it."""
+    ball = '<body pos="0 0 {}"><joint type="slide" axis="0 0 1"/><geom name="{}" size=".1" mass="{}"/></body>'
+    world = FLOOR.replace("0.004", "0.002") + ball.format(0.1, "low", 1) + ball.format(3.2, "high", 50)
+    found = proposed(f"<mujoco>{world}</worldbody></mujoco>")
+    later = proposal.run_trial(found.drive, np.zeros((1, 2)), 500)
+    assert found.horizon * 0.002 < math.sqrt(2 * 2.9 / 9.81)
+    ((pair, touch),) = found.touches.items()
+    assert later.touches[pair].depth > 5 * touch.depth
+
+
+def test_activations_are_the_keyframes(begin: Callable[..., Begun]) -> None:
+    """An integrator's, in test rollouts and in the file."""
+    task, _, _, found = begin(INTEGRATOR)
+    assert task.draw_start(jax.random.key(0)).act.tolist() == [0.5]
+    assert start_of(found.scene.host).act.tolist() == [0.5]
 
 
 def test_a_wheel_on_its_axle_is_to_turn() -> None:

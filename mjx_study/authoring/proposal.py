@@ -12,7 +12,6 @@ from mjx_study.authoring.aim import Aim, choose_aim, rounded
 from mjx_study.authoring.trial import MOST_TRIED, SECONDS, Drive, Touch, Trial, moments_of, run_trial, start_of
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.scene import Scene
-from mjx_study.table import grouped
 
 TRIALS: Final = 16  # test rollouts with noise, and as many with held controls
 NOISE: Final = 0.1  # share of half a control's range or of its substitute, or [m/s, rad/s] of velocities
@@ -56,8 +55,7 @@ class Proposal:
     """A task for a scene.
 
     Attributes:
-        touches, shares: pairs of geoms in contact in any test rollout, with the earliest touch of each, and the share
-            of the test rollouts in which each touches.
+        touches: pairs of geoms in contact in any test rollout, with the earliest touch of each.
         limits: names of joints that reach a limit.
         pair: names of the geoms whose contact is swept; None without one that has names.
         load: what that contact carries; None without one.
@@ -69,7 +67,6 @@ class Proposal:
     horizon: int
     aim: Aim
     touches: dict[tuple[int, int], Touch]
-    shares: dict[tuple[int, int], float]
     limits: tuple[str, ...]
     pair: tuple[str, str] | None
     load: Load | None
@@ -111,14 +108,14 @@ def propose(scene: Scene) -> Proposal:
     if aim is None:
         changes = "initial velocities" if drive.at_start else "controls"
         raise ValueError(f"{scene.name}: noise on its {changes} of {drive.scale:g} moves nothing; give it room to move")
-    rollouts = [quiet, *noisy]
-    touches, shares = _touches(rollouts, steps)
+    rollouts = [run_trial(drive, np.zeros((1, drive.size)), steps), *noisy]
+    touches = _touches(rollouts)
     pair = _pair(scene, aim, touches)
     load = None if pair is None else _load(scene, pair, touches)
     stiffnesses = () if load is None else _stiffnesses(load, scene.timestep)
     limits = sorted({joint for trial in rollouts for joint in trial.limits})
     names = tuple(host.joint(joint).name or f"joint {joint}" for joint in limits)
-    return Proposal(scene, drive, steps, aim, touches, shares, names, pair, load, stiffnesses)
+    return Proposal(scene, drive, steps, aim, touches, names, pair, load, stiffnesses)
 
 
 def _longest(host: mujoco.MjModel) -> int:
@@ -164,15 +161,15 @@ def _trials(drive: Drive, steps: int) -> tuple[list[Trial], list[Trial]]:
     return [each for each in noisy if each.steps == steps], [each for each in far if each.steps == steps]
 
 
-def _touches(trials: Sequence[Trial], steps: int) -> tuple[dict[tuple[int, int], Touch], dict[tuple[int, int], float]]:
-    """Contacts within the horizon of any rollout: the earliest and deepest, and the share of rollouts."""
-    every = [(pair, touch) for trial in trials for pair, touch in trial.touches.items() if touch.first < steps]
-    found, shares = {}, {}
-    for pair, alike in grouped(every, lambda each: each[0]).items():
-        earliest = min((touch for _, touch in alike), key=lambda touch: touch.first)
-        found[pair] = dataclasses.replace(earliest, depth=max(touch.depth for _, touch in alike))
-        shares[pair] = len(alike) / len(trials)
-    return found, shares
+def _touches(trials: Sequence[Trial]) -> dict[tuple[int, int], Touch]:
+    """Contacts of any rollout: the earliest touch, the greatest depth, and the share of rollouts."""
+    found = {}
+    for pair in dict.fromkeys(pair for trial in trials for pair in trial.touches):
+        alike = [trial.touches[pair] for trial in trials if pair in trial.touches]
+        earliest = min(alike, key=lambda touch: touch.first)
+        depth = max(touch.depth for touch in alike)
+        found[pair] = dataclasses.replace(earliest, depth=depth, share=len(alike) / len(trials))
+    return found
 
 
 def _pair(scene: Scene, aim: Aim, touches: dict[tuple[int, int], Touch]) -> tuple[str, str] | None:
@@ -198,5 +195,5 @@ def _load(scene: Scene, pair: tuple[str, str], touches: dict[tuple[int, int], To
 def _stiffnesses(load: Load, timestep: float) -> tuple[float, ...]:
     """Stiffnesses [N/m], from one at which the geoms sink in little to one that the timestep resolves."""
     high = load.mass * (RESOLVED / timestep) ** 2
-    low = min(load.stiffness(SINKING * load.size), high / 10)
+    low = min(load.stiffness(SINKING * load.size) or high, high / 10)  # 0 where neither weight nor speed presses
     return tuple(rounded(value, 1) for value in np.geomspace(low, high, STIFFNESSES).tolist())

@@ -49,16 +49,11 @@ def source_of_task(mjcf: Path, found: Proposal) -> str:
         WEIGHT=WEIGHT,
         mjcf=mjcf,
         found=found,
-        host=host,
-        drive=drive,
-        aim=aim,
         name=name,
         body=body,
         joint=joint,
         unit=unit,
         place=f"{module_name(mjcf)}:{name}",
-        swept=found.pair is not None,
-        timestep=found.scene.timestep,
         touches=[_touch(found, pair, touch) for pair, touch in by_time],
         actuators=[_actuator(host, index) for index in range(host.nu)],
         description=f"move {_comment(subject)} by {aim.side * aim.distance:g}{unit}"
@@ -72,7 +67,7 @@ def _touch(found: Proposal, pair: tuple[int, int], touch: Touch) -> str:
     after = touch.first * found.scene.timestep
     begin = f"touch after {number(after, 2)} s at {number(touch.speed, 2)} m/s"
     begin = "touch from the start" if touch.first <= 1 else begin
-    often = "" if found.shares[pair] == 1 else f", in {found.shares[pair]:.0%} of the rollouts"
+    often = "" if touch.share == 1 else f", in {touch.share:.0%} of the rollouts"
     return _comment(f"{names}: {begin}, up to {number(1e3 * touch.depth, 2)} mm deep{often}")
 
 

@@ -40,12 +40,13 @@ class Drive:
 
 @dataclasses.dataclass
 class Touch:
-    """A pair of geoms in contact during a rollout: step of the first touch, approach speed then [m/s], and greatest
-    penetration [m]."""
+    """A pair of geoms in contact during a rollout: step of the first touch, approach speed then [m/s], greatest
+    penetration [m]; and of several rollouts, the share in which they touch."""
 
     first: int
     speed: float
     depth: float = 0.0
+    share: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
