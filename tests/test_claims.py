@@ -63,7 +63,8 @@ def test_intervals() -> None:
     assert interval_of(planted(2.0), 1 - 0.05 / 400)[1] > interval_of(planted(2.0), LEVEL)[1] > high
     share = share_of(np.arange(400) < 300, "trials")
     assert interval_of(share, 0.95) == pytest.approx((0.7053, 0.7899), abs=1e-3)  # Wilson's
-    assert interval_of(Statistic(math.inf), LEVEL) == (-math.inf, math.inf)
+    for unknown in (Statistic(math.inf), Statistic(1.0, math.nan)):
+        assert interval_of(unknown, LEVEL) == (-math.inf, math.inf)
     top, bottom = np.random.default_rng(0).chisquare(1, (2, 10_000)) * np.array([[10.0], [1.0]])
     ratio = ratio_of(top, bottom, "samples")
     assert ratio.estimate == pytest.approx(1.0, abs=4 * ratio.error)

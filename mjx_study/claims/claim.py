@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from mjx_study.choices import laws_of
-from mjx_study.claims.laboratory import Effort, Laboratory, Statistic
+from mjx_study.claims.laboratory import Effort, Statistic
 from mjx_study.identity import VERSIONED, code_of
 from mjx_study.runtime import precision
 from mjx_study.version import version_of
@@ -74,9 +74,6 @@ class Claim:
         """Pairs of system and family, each with its own verdict."""
         return [(system, family) for system, families in self.systems.items() for family in families]
 
-    def statistic(self, lab: Laboratory, system: str, family: str) -> Statistic:
-        return self.measure(lab, system, family, **self.options)
-
     def key(self, effort: Effort) -> str:
         """Digest of what the claim requires, whatever its wording, the effort and the precision."""
         return _digest(self.id, self.criterion.holds, self.criterion.reversed, self.systems, effort, precision())
@@ -93,6 +90,7 @@ def load_claims(modules: Mapping[str, ModuleType]) -> dict[str, Claim]:
     families, systems = definitions["families"], definitions["systems"]
 
     def claim(name: str, fields: dict[str, Any]) -> Claim:
+        fields = definitions["ranges"].get(fields.get("range"), {}) | fields
         module, function = fields["measure"].split(".")
         chosen = systems[fields["systems"]] if isinstance(fields["systems"], str) else fields["systems"]
         expanded = {
@@ -104,7 +102,7 @@ def load_claims(modules: Mapping[str, ModuleType]) -> dict[str, Claim]:
         }
         return Claim(
             name,
-            fields["place"],
+            fields.get("place", "this project"),
             fields["statement"],
             Criterion(fields["quantity"], **ranges),
             expanded,

@@ -35,7 +35,7 @@ def interval_of(statistic: Statistic, level: float) -> Range:
         covered = jnp.arange(statistic.trials) < round(statistic.estimate * statistic.trials)
         return coverage_interval(covered, level)[1:]
     half = statistic.slack
-    if statistic.error > 0:
+    if statistic.error != 0:  # NaN, too: then it is unknown
         half += statistic.error * float(student.ppf(0.5 + level / 2, statistic.freedom))
     if not math.isfinite(statistic.estimate + half):
         return -math.inf, math.inf
@@ -97,7 +97,7 @@ def measure_ledger(
             kept = {**ours, "revision": git_revision(), "cases": []}
         for system, family in claim.cases[len(kept["cases"]) :]:
             progress(done + len(kept["cases"]), total, f"{claim.id}: {system}, {family}")
-            statistic = claim.statistic(lab, system, family)
+            statistic = claim.measure(lab, system, family, **claim.options)
             kept["cases"].append({"system": system, "family": family, **dataclasses.asdict(statistic)})
             if path is not None:
                 write_whole(path, lambda file, kept=kept: file.write(json.dumps(kept, indent=1).encode()))
