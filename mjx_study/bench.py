@@ -37,7 +37,7 @@ from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED
-from mjx_study.tasks.contact_grid import ContactPoint, family_grid, single_contact
+from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
@@ -131,22 +131,16 @@ class BenchReport:
         ]
 
 
-def check_bench(task: Task, samples: int, contact: ContactPoint | None = None) -> None:
+def check_bench(task: Task, samples: int) -> None:
     """Raise ValueError for fewer than one sample, more than fit into memory, or a task that cannot be simulated."""
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     check_soundness(task)
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
-    if contact is None:
-        single_contact(task)
 
 
-def run_bench(
-    task: Task, samples: int, progress: Progress = silent, contact: ContactPoint | None = None, seed: int = 0
-) -> BenchReport:
-    """Measure everything, interleaved with the baselines, in a contact, by default that of a single run; report medians
-    of repeats."""
-    cell = single_contact(task)[0] if contact is None else contact
+def run_bench(task: Task, samples: int, cell: ContactPoint, progress: Progress = silent, seed: int = 0) -> BenchReport:
+    """Measure everything in a contact, interleaved with the baselines; report medians of repeats."""
     devices = local_devices()
     keys = jax.random.split(jax.random.key(seed), samples)
     simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1], [task]))

@@ -222,7 +222,7 @@ def test_diagnose_judges_means_under_every_law() -> None:
 @pytest.mark.slow
 def test_bench_leaves_out_rivals_of_another_law() -> None:
     task = make_task("pusher", horizon=3)
-    report = run_bench(task, 6, contact=single_contact(task, "hunt_crossley", 100.0)[0])
+    report = run_bench(task, 6, single_contact(task, "hunt_crossley", 100.0)[0])
     assert report.contact.startswith("hunt_crossley")
     assert set(report.ratios) == {"gradient_per_value", "onset_per_gradient"}
     assert any("left out" in line for line in report.lines())

@@ -30,8 +30,8 @@ def run(options: argparse.Namespace) -> int:
         task = task_of(options)
         given = options.contact, options.stiffness, options.damping, options.smoothing
         contact, messages = single_contact(task, *given)
-        check_bench(task, options.samples, contact)
+        check_bench(task, options.samples)
     with computing() as progress:
-        report = run_bench(task, options.samples, progress, contact, options.seed or 0)
+        report = run_bench(task, options.samples, contact, progress, options.seed or 0)
     lines = [*report.lines(), *(f"warning: {message}" for message in messages)]
     return print_report(options, report.as_json() | {"warnings": list(messages)}, lines)
