@@ -7,7 +7,6 @@ steps reveals.
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, Final
@@ -18,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
-from estimators.mean_check import NODES, TOLERANCE, Circulation, circulations
+from estimators.mean_check import NODES, Circulation, circulations
 from estimators.registry import find_estimator, label_of
 from mjx_study.diagnose.columns import MEANS
 from mjx_study.experiment.resolution import CORRECTED, check_estimators, direction_of, reads_onset
@@ -99,8 +98,9 @@ def along_means(
     each = max(2, samples // len(paths))
     found = []
     for done, along in enumerate(paths):
-        node, ends = partial(_node, progress, done, len(paths)), (theta - along, theta + along)
-        found.append(circulations(estimators, objective, *ends, jax.random.key(seed), each, progress=node))
+        report = lambda node, before=NODES * done: progress(before + node, NODES * len(paths))  # noqa: E731
+        ends = theta - along, theta + along
+        found.append(circulations(estimators, objective, *ends, jax.random.key(seed), each, progress=report))
     return [
         [dataclasses.replace(one, difference=first.difference) for one, first in zip(path, found[0], strict=True)]
         for path in found
@@ -110,10 +110,6 @@ def along_means(
 def in_nodes(progress: Progress, done: int, total: int, what: str) -> Nodes:
     """Report nodes within one of several pieces of work."""
     return lambda node, nodes: progress(done, total, f"{what}; means along paths, node {node + 1} of {nodes}")
-
-
-def _node(progress: Nodes, paths_done: int, paths: int, node: int) -> None:
-    progress(NODES * paths_done + node, NODES * paths)
 
 
 def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
@@ -145,7 +141,6 @@ def check_mean(
     names: Sequence[str] = (),
     span: Sequence[float] | None = None,
     direction: str = "random",
-    tolerance: float = TOLERANCE,
     progress: Progress = silent,
 ) -> list[MeanCheck]:
     """Check every estimator for every contact model.
@@ -158,7 +153,6 @@ def check_mean(
         span: ends of the path, from theta along the direction [unit of theta]; None for two standard deviations of the
             noise to either side, or 0.02 for noise on the controls.
         direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
-        tolerance: share of the cost's difference within which a mean is right.
 
     Raises:
         ValueError: an estimator's formula does not apply to the task, or the direction is invalid.
@@ -176,10 +170,10 @@ def check_mean(
         if direction == ALONG_MEANS:
             paths = _along_own(estimators, objective, task.theta, reach_of(task), samples, seed, nodes)
         else:
-            node = partial(_node, nodes, 0, 1)
-            paths = [circulations(estimators, objective, *ends, key, samples, progress=node)]
+            report = lambda node, nodes=nodes: nodes(node, NODES)  # noqa: E731
+            paths = [circulations(estimators, objective, *ends, key, samples, progress=report)]
         found += [
-            MeanCheck(cell.family, cell.stiffness_or_zero, name, each, each.verdict(tolerance))
+            MeanCheck(cell.family, cell.stiffness_or_zero, name, each, each.verdict())
             for numbers in paths
             for name, each in zip(names or [estimator.name for estimator in estimators], numbers, strict=True)
         ]

@@ -107,17 +107,8 @@ def _degenerate(host: mujoco.MjModel, geoms: tuple[int, ...], cause: str) -> Deg
     return DegenerateContact(cause, movers, frozenset(moved.tolist()))
 
 
-def cause_of_fault(context: FindingContext, output: Coordinate, source: Coordinate, *, stock: bool = False) -> str:
-    """Return the likely reason why a derivative is wrong, zero or NaN."""
-    return next(_faults(context, output, source, stock), "cause unknown")
-
-
-def cause_of_kink(context: FindingContext, output: Coordinate, source: Coordinate) -> str:
-    """Return the switch that makes the step nonsmooth."""
-    return next(_kinks(context, output, source))
-
-
-def _faults(context: FindingContext, output: Coordinate, source: Coordinate, stock: bool) -> Iterator[str]:
+def faults(context: FindingContext, output: Coordinate, source: Coordinate, stock: bool) -> Iterator[str]:
+    """Reasons why a derivative may be wrong, zero or NaN, the likeliest first."""
     host, state, stages = context.host, context.state, context.stages
     if context.singular:
         yield SINGULAR
@@ -157,9 +148,11 @@ def _faults(context: FindingContext, output: Coordinate, source: Coordinate, sto
         yield "the elliptic cone at zero tangential velocity"
     if stock and num_constraint_rows(context.layout.scene.template) and output.block != "act":
         yield "mjx.step differentiates the iterations of its solver and line search, not the solution they approach"
+    yield "cause unknown"
 
 
-def _kinks(context: FindingContext, output: Coordinate, source: Coordinate) -> Iterator[str]:
+def kinks(context: FindingContext, output: Coordinate, source: Coordinate) -> Iterator[str]:
+    """Switches that may make the step nonsmooth, the likeliest first."""
     host = context.host
     if source.block == "ctrl":
         column = context.layout.columns("ctrl").index(context.layout.inputs.index(source))

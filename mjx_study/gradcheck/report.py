@@ -211,8 +211,7 @@ class GradcheckReport:
     @property
     def passed(self) -> bool:
         """Whether no derivative of the project is wrong, NaN, silently zero or unconverged."""
-        verdicts = [check.verdict for check in (*self.costs, *self.steps)]
-        return not any(verdict in FAILURES for verdict in verdicts) and not any(f.fails for f in self.findings)
+        return not self.failure
 
     @property
     def failure(self) -> str:

@@ -10,20 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_study.gradcheck import diagnosis
-from mjx_study.gradcheck.causes import ROUNDING_DECIDES, SINGULAR, FindingContext, cause_of_fault, cause_of_kink
+from mjx_study.gradcheck.causes import ROUNDING_DECIDES, SINGULAR, FindingContext, faults, kinks
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.coverage import Coverage
-from mjx_study.gradcheck.diagnosis import (
-    ENGINE,
-    JUMP,
-    NAN,
-    RIGHT,
-    UNRESOLVED,
-    VERDICTS,
-    Codes,
-    judge,
-    worst_error,
-)
+from mjx_study.gradcheck.diagnosis import ENGINE, JUMP, NAN, RIGHT, UNRESOLVED, VERDICTS, Codes, judge, worst_error
 from mjx_study.gradcheck.differences import (
     SHAKE,
     Differences,
@@ -214,11 +204,11 @@ def _of_entries(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind,
                 continue  # inherited from the step, so already attributed to the project
             output, source = layout.outputs[row], layout.inputs[column]
             if not smooth:
-                cause = cause_of_kink(check.context, output, source)
+                cause = next(kinks(check.context, output, source))
             elif verdict == "unconverged":
                 cause = _budget(layout)
             else:
-                cause = cause_of_fault(check.context, output, source, stock=who == STOCK)
+                cause = next(faults(check.context, output, source, who == STOCK))
             modes = tuple(mode for mode, codes in judged.items() if codes[row, column] == worst[row, column])
             derivative, difference, gap = (
                 float(values[row, column])
