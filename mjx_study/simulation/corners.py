@@ -7,6 +7,7 @@ one corner may replace another between two steps.
 
 from typing import Any, Final, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -61,7 +62,8 @@ def corners(
     normal, contact = data.geom_xmat[plane][:, 2], rows.contact
     place = data.geom_xpos[geom] + _vertices(model, geom) @ data.geom_xmat[geom].T
     height = (place - data.geom_xpos[plane]) @ normal
-    rise = _motion(model, data, normal, place, geom) - _motion(model, data, normal, place, plane)
+    jacobian, body = mjx_module("support").jac, int(model.geom_bodyid[geom])
+    rise = jax.vmap(lambda point: jacobian(model, data, point, body)[0] @ normal)(place)  # planes cannot move
 
     own = jnp.all(contact.geom == jnp.array(pair), axis=1) & (contact.dist != 1)  # 1 where a slot is empty
     bottom = contact.pos + contact.dist[:, None] / 2 * normal
@@ -100,18 +102,3 @@ def _vertices(model: mjx.Model, geom: int) -> Float[Array, "corners 3"]:
         return jnp.asarray(signs, model.geom_size.dtype) * model.geom_size[geom]
     implementation: Any = model._impl
     return implementation.mesh_convex[model.geom_dataid[geom]].vert
-
-
-def _motion(
-    model: mjx.Model, data: mjx.Data, normal: Float[Array, "3"], place: Float[Array, "corners 3"], geom: int
-) -> Float[Array, "corners nv"]:
-    """Derivative over the coordinates of the heights of points that move with a geom's body."""
-    body, moving = int(model.geom_bodyid[geom]), []
-    root = model.body_rootid[body]
-    while body:
-        moving.append(body)
-        body = int(model.body_parentid[body])
-    turning, sliding = jnp.split(data.cdof, 2, axis=1)
-    arm = place - data.subtree_com[root]
-    rises = sliding @ normal + jnp.cross(arm, normal) @ turning.T
-    return rises * np.isin(model.dof_bodyid, moving)

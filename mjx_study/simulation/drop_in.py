@@ -7,13 +7,13 @@ Both trace MJX's own pipeline with the patches of `patches`, and wrap MJX's own 
 import contextlib
 from collections.abc import Callable, Generator
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import mujoco
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mjx_study.choices import unknown
 from mjx_study.graph.derivative_rule import instantiated, with_rule
@@ -27,27 +27,13 @@ from mjx_study.simulation.observed import differentiated_once, tangent_of
 from mjx_study.simulation.over_model import Moving
 from mjx_study.simulation.patches import Place, patched
 from mjx_study.simulation.saltation import onset_term
-from mjx_study.simulation.touch import Events, crossings, onset_begins
+from mjx_study.simulation.touch import Past, changes, event_of, onset_begins
 
 Replacements = dict[Place, Callable[..., mjx.Data]]
 Whole = Callable[[list[Any]], mjx.Model]
 """Makes a model from its traced leaves; the others stay constants, so that steps are native code."""
 ONSETS: Final = ("none", "linear")
 """Treatments of the onset of contact in the derivatives of a step."""
-
-
-class Preceding(NamedTuple):
-    """What the preceding step left of limits and contacts.
-
-    Attributes:
-        course: what their guards did in it.
-        existed: whether they existed in it; none does at time 0.
-        begun: whether they had just begun then.
-    """
-
-    course: guards.Course
-    existed: Bool[Array, " guards"]
-    begun: Bool[Array, " guards"]
 
 
 def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
@@ -170,19 +156,20 @@ _REPLACED: Final[dict[str, Replacements]] = {
 }
 
 
-def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Preceding:
-    """What the preceding step did, from the constraint rows that it left in its state.
+def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Past:
+    """What the preceding step did, from the constraint rows that it left in its state; none does at time 0.
 
     After `mjx.forward` the rows are those of the state itself, and no contact is seen to end. The velocity before that
     step, which tells whether contact had just begun, is approximate where damping is integrated implicitly.
     """
     before = data.qvel - model.opt.timestep * data.qacc
     course = entry_by_entry(guards.course, model, data, before, data.qvel, data.qacc)
-    existed = (course.distance < 0) & (data.time > 0)
-    return Preceding(course, existed, existed & onset_begins(course.distance, model.opt.timestep * course.speed))
+    begun = onset_begins(course.distance, model.opt.timestep * course.speed)
+    none = jnp.zeros((), jnp.int32)
+    return Past(course, (course.distance < 0) & ~begun, (data.time > 0).astype(jnp.int32), none, none)
 
 
-def _corrected_step(whole: Whole, traced: list[Any], data: mjx.Data, preceding: Preceding) -> mjx.Data:
+def _corrected_step(whole: Whole, traced: list[Any], data: mjx.Data, preceding: Past) -> mjx.Data:
     """`mjx.step` with the same values, but derivatives that include the onset term.
 
     Delta is that from the velocity of step k, since the state does not contain the one before: an error of order h in
@@ -208,7 +195,7 @@ def _onset_change(whole: Whole, *arguments: Any) -> tuple[Qvel, Qvel]:
         arguments: these, the state, what preceded it, and the change of position, also before the step.
     """
 
-    def zeros(traced: list[Any], data: mjx.Data, preceding: Preceding, moved: Qvel, before: Qvel) -> tuple[Qvel, Qvel]:
+    def zeros(traced: list[Any], data: mjx.Data, preceding: Past, moved: Qvel, before: Qvel) -> tuple[Qvel, Qvel]:
         return jnp.zeros_like(moved), jnp.zeros_like(moved)
 
     def rule(primals: Any, changes: Any) -> tuple[tuple[Qvel, Qvel], tuple[Qvel, Qvel]]:
@@ -228,29 +215,23 @@ def _course_here(model: mjx.Model, data: mjx.Data) -> guards.Course:
 
 
 def _step_terms(
-    model: mjx.Model, data: mjx.Data, preceding: Preceding, moving: Moving
+    model: mjx.Model, data: mjx.Data, preceding: Past, moving: Moving
 ) -> tuple[Float[Array, "nv changes"], Float[Array, "nv changes"]]:
     """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins or ends; see `onset_term`."""
     here = entry_by_entry(_course_here, model, data)
     empty = jnp.zeros((model.nv, model.nv + sum(leaf.size for leaf in moving.values())), data.qvel.dtype)
     if not here.distance.size:
         return empty, empty
-    existed, active = preceding.existed, here.distance < 0
-    crossing = crossings(here, preceding.course, model.opt.timestep)
-    ends = existed & preceding.course.pushes & (~active | crossing.ends)
-    begins = crossing.begins | (active & ~existed)
+    found = changes(here, preceding, model.opt.timestep)[1]
     states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
 
     def add(carry):
-        left, *sums = carry
-        guard = jnp.argmax(left)
-        brief, others = ends[guard] & preceding.begun[guard], crossing.others(guard)
-        event = Events(jnp.zeros((), int), guard, ends[guard], brief, *others, jnp.array(True))
+        number, *sums = carry
+        event = event_of(found, number, preceding.steps)
         term = onset_term(with_solver, model, data, states, data.ctrl[None], event, moving)[0]
         parts = (jnp.outer(each, term.slope) for each in (term.spread, term.shift))
-        return left.at[guard].set(False), *(total + part for total, part in zip(sums, parts, strict=True))
+        return number + 1, *(total + part for total, part in zip(sums, parts, strict=True))
 
     # the loop over a batch ends with the last event of any sample
-    left = (begins | ends) & (data.time > 0)
-    _, here, previous = jax.lax.while_loop(lambda carry: jnp.any(carry[0]), add, (left, empty, empty))
+    _, here, previous = jax.lax.while_loop(lambda carry: carry[0] < found.after, add, (found.before, empty, empty))
     return here, previous

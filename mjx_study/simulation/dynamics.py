@@ -109,10 +109,6 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tupl
     Returns:
         The state after the step, and the solver's relative residual (see `constraint.residual`).
     """
-    if isinstance(model, LawModel):
-        following, qacc, residual = _step_of_law(scene, model, state, control)
-        qacc, residual = jax.lax.stop_gradient((qacc, residual))
-        return dataclasses.replace(following, warmstart=qacc), residual
     following, residual = _differentiable_step(scene, model, state, control)
     warmstart, residual = jax.lax.stop_gradient((following.warmstart, residual))
     return dataclasses.replace(following, warmstart=warmstart), residual
@@ -120,8 +116,6 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tupl
 
 def acceleration(scene: Scene, model: mjx.Model, state: State, control: Control) -> Qvel:
     """Constrained acceleration during a `step` [m/s^2 or rad/s^2], with its implicit derivative."""
-    if isinstance(model, LawModel):
-        return _step_of_law(scene, model, state, control)[1]
     return _differentiable_step(scene, model, state, control)[0].warmstart
 
 
@@ -135,8 +129,8 @@ def exact_step(scene: Scene, model: mjx.Model, state: State, control: Control) -
     return _solved(constraint.solve_to_rounding, scene, model, state, control)
 
 
-def _step_of_law(scene: Scene, model: LawModel, state: State, control: Control) -> tuple[State, Qvel, Scalar]:
-    """`step` under another law than MuJoCo's, and the acceleration in it, with its derivative."""
+def _step_of_law(scene: Scene, model: LawModel, state: State, control: Control) -> tuple[State, Scalar]:
+    """`step` under another law than MuJoCo's, with a derivative of the acceleration, too."""
     traced_model, whole = traced_part(model)
     values, equations = partial(model.law.step, scene), model.law.equations(scene)
 
@@ -159,7 +153,7 @@ def _step_of_law(scene: Scene, model: LawModel, state: State, control: Control) 
 
     advance = with_rule(stepped, rule)
     qpos, qvel, act, qacc, residual = advance(traced_model, state.qpos, state.qvel, state.act, control)
-    return State(qpos, qvel, act, qacc), qacc, residual
+    return State(qpos, qvel, act, qacc), residual
 
 
 def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Control) -> mjx.Data:
@@ -334,6 +328,8 @@ def advance_velocity(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> tuple[Qvel
 
 def _differentiable_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar]:
     """`step`, with a derivative of the acceleration, too: for second derivatives."""
+    if isinstance(model, LawModel):
+        return _step_of_law(scene, model, state, control)
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         explicit = partial(_runge_kutta, scene)
         taped = jax.checkpoint(explicit)

@@ -130,19 +130,12 @@ class Course(NamedTuple):
     points: Points | None
 
 
-def motion(
-    model: mjx.Model, data: mjx.Data, qvel: Qvel, ends: bool | Bool[Array, ""]
-) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-    """Distance of every guard [m or rad], and its rate at a velocity [m/s or rad/s]."""
-    found = find_guards(model, data, qvel, ends)
-    return found.distance, found.speed
-
-
 def course(model: mjx.Model, data: mjx.Data, qvel: Qvel, after: Qvel, qacc: Qvel) -> Course:
     """Course of the guards in a step from velocity `qvel` to velocity `after`, with acceleration `qacc`."""
     force = jnp.abs(row_forces_at(model, data, qacc))
-    found, leaving = find_guards(model, data, qvel, ends=False), motion(model, data, after, ends=True)
-    return Course(found.distance, found.speed, *leaving, found.members @ force > 0, contact_points(model, data))
+    found, later = find_guards(model, data, qvel, ends=False), find_guards(model, data, after, ends=True)
+    pushes, points = found.members @ force > 0, contact_points(model, data)
+    return Course(found.distance, found.speed, later.distance, later.speed, pushes, points)
 
 
 def contact_points(model: mjx.Model, data: mjx.Data) -> Points | None:

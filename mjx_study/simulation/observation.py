@@ -9,7 +9,6 @@ All are differentiable: positions and velocities through MJX's kinematics (as gr
 """
 
 import dataclasses
-from collections.abc import Iterable
 from functools import partial
 from typing import Any, Final
 
@@ -20,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators.choices import suggestion
+from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
@@ -66,7 +66,7 @@ _UNKNOWN: Final = {
 _LATE: Final = int(mujoco.mjtStage.mjSTAGE_ACC)
 
 
-@jax.tree_util.register_pytree_with_keys_class
+@partial(register_pytree, static=("scene",))
 @dataclasses.dataclass(frozen=True)
 class ObservedState(State):
     """A `State` that also computes any of `QUANTITIES` of its scene, when asked for it.
@@ -87,18 +87,6 @@ class ObservedState(State):
     scene: Scene
     contact: ContactModel | None = None
     control: Float[Array, "*batch nu"] | None = None
-
-    def tree_flatten_with_keys(self) -> tuple[tuple[Any, ...], Scene]:
-        names = (field.name for field in dataclasses.fields(self) if field.name != "scene")
-        return tuple((jax.tree_util.GetAttrKey(name), getattr(self, name)) for name in names), self.scene
-
-    @classmethod
-    def tree_unflatten(cls, scene: Scene, children: Iterable[Any]) -> "ObservedState":
-        state = object.__new__(cls)  # unchecked, as in `estimators.pytree`
-        names = (field.name for field in dataclasses.fields(cls) if field.name != "scene")
-        for name, child in [*zip(names, children, strict=True), ("scene", scene)]:
-            object.__setattr__(state, name, child)
-        return state
 
     def __getattr__(self, name: str) -> Float[Array, "..."]:
         if name not in QUANTITIES:

@@ -10,14 +10,13 @@ from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.graph.derivative_rule import flat_with_rule, refusing, with_rule
 from mjx_study.graph.scalars import traced_part
-from mjx_study.simulation import constraint, guards
+from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.constraint import Qvel, Rows, Scalar
+from mjx_study.simulation.constraint import Qvel, Scalar
 from mjx_study.simulation.dynamics import Act, Control, Controls, Point, State, change_over, observed_step, with_solver
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Changes, Events, Past, changes
@@ -90,14 +89,9 @@ def observed_rollout(scene: Scene, model: mjx.Model, start: State, acted: Acted,
     return Observed(last, past, before, controls, after, residuals, costs, found)
 
 
-def timestep_of(scene: Scene, model: mjx.Model) -> float | Scalar:
-    """Timestep h [s] of a model, with its derivative; a number where it is the scene's."""
-    return model.opt.timestep if isinstance(model.opt.timestep, Tracer) else scene.timestep
-
-
 def _observed(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Control, past: Past):
     after, residual, course = observed_step(scene, solver, model, state, control)
-    return after, residual, *changes(course, past, timestep_of(scene, model))
+    return after, residual, *changes(course, past, model.opt.timestep)
 
 
 def moving_values(known: Any, moving: Any) -> Any:
@@ -138,34 +132,6 @@ def over_events(function: Callable[[Events], Any], events: Events) -> Any:
     grouped = jax.tree.map(lambda leaf: jnp.resize(leaf, (-(-slots // math.prod(few)), *few, *leaf.shape[1:])), events)
     _, each = jax.lax.scan(fill, None, grouped)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[1 + len(few) :])[:slots], each)
-
-
-class GuardAtTouch(NamedTuple):
-    """A guard that passes zero.
-
-    Attributes:
-        normal: derivative of its distance.
-        weights, deep: as in `guards.Guards`.
-        members: the rows that begin or end with it.
-        absent: rows of the event's `absent` guards.
-        touching: rows without penetration.
-    """
-
-    normal: Qvel
-    weights: Rows
-    deep: Bool[Array, ""]
-    members: Rows
-    absent: Rows
-    touching: Rows
-
-
-def guard_at(model: mjx.Model, positioned: mjx.Data, qvel: Qvel, event: Events) -> GuardAtTouch:
-    """The guard of an event, at the position stage of its touch and the velocity with which it moves there."""
-    found = guards.find_guards(model, positioned, qvel, event.ends)
-    flags, members = (event.absent, event.touching & ~found.deep), found.members
-    absent, touching = (each.astype(members.dtype) @ members for each in flags)
-    weights, deep = found.weights[event.guard], found.deep[event.guard]
-    return GuardAtTouch(found.slopes(event.guard), weights, deep, members[event.guard], absent, touching)
 
 
 def least_travel(model: mjx.Model, across: Float[Array, " 2"], either: Bool[Array, ""], rate: Scalar) -> Scalar:

@@ -29,7 +29,7 @@ def slope_over(
 
     def distance(moving: Moving) -> Scalar:
         moved = structure.unflatten([moving.get(place, leaf) for place, leaf in enumerate(leaves)])
-        return guards.motion(moved, fwd_position(moved, positioned), qvel, event.ends)[0][event.guard]
+        return guards.find_guards(moved, fwd_position(moved, positioned), qvel, event.ends).distance[event.guard]
 
     return ravel_pytree(jax.grad(distance)(dict(moving)))[0].astype(qvel.dtype)
 

@@ -37,11 +37,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from mjx_study.graph.native import native_identity
-from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Rows, Scalar
@@ -57,19 +54,16 @@ from mjx_study.simulation.dynamics import (
     with_solver,
 )
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.linear_algebra import MOST_UNROLLED
 from mjx_study.simulation.observed import (
     Known,
     Observed,
     Replay,
     along_events,
-    guard_at,
     known_step,
     least_travel,
     moving_values,
     over_events,
     tangent_of,
-    timestep_of,
 )
 from mjx_study.simulation.over_model import Moving, moved_by_model, slope_over
 from mjx_study.simulation.scene import Scene
@@ -101,7 +95,7 @@ def saltation(
         events: its events.
         weight: factor of the term.
     """
-    timestep = timestep_of(scene, model)
+    timestep = model.opt.timestep
     terms, counts = _terms_of(scene, fixed_model, seen, events)
     spread, shift, slope = jax.lax.stop_gradient((weight * terms.spread, weight * terms.shift, terms.slope))
     of_model = moved_by_model(scene, model, seen.before, events)[:, None]
@@ -132,15 +126,11 @@ def _terms_of(scene: Scene, model: mjx.Model, seen: Observed, events: Events) ->
         pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
         qpos, qvel, act, inputs, solved = map(pick, (before.qpos, before.qvel, before.act, controls, after.warmstart))
         states = State(qpos, qvel, act, jnp.where(event.ends, solved[::-1], solved))
-        given, in_parts = (model, scene.template, states, inputs, event), partial(onset_term, with_solver)
-        if model.nv <= MOST_UNROLLED:
-            return entry_by_entry(partial(onset_term, with_run_solver), *given)
-        if native_identity() is None or isinstance(model.body_mass, Tracer):
-            return in_parts(*given)
-        return unrolled(partial(onset_term, with_newton), *given, otherwise=in_parts)
+        whole, in_parts = partial(onset_term, with_newton), partial(onset_term, with_solver)
+        return entry_by_entry(whole, model, scene.template, states, inputs, event, otherwise=in_parts)
 
     terms, strength, narrow, valid, rate = over_events(term, events)
-    chatters = events.chattering(rate, timestep_of(scene, model))
+    chatters = events.chattering(rate, model.opt.timestep)
     spread, shift = (jnp.where(chatters[:, None], 0.0, part) for part in (terms.spread, terms.shift))
     terms = terms._replace(spread=spread, shift=shift)
     return terms, events.counts(seen.past, valid, narrow, strength, chatters)
@@ -195,13 +185,8 @@ def onset_term(
     return term, strength, valid & (jnp.abs(touch.travel) < least), valid, found.rate
 
 
-def with_run_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
-    """Evaluate `function(solver, model, *arguments)` in MJX's operations."""
-    return function(constraint.run_solver, model, *arguments)
-
-
 def with_newton(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
-    """The same with Newton's method, for native code."""
+    """Evaluate `function(solver, model, *arguments)` with Newton's method, as part of a graph."""
     return function(constraint.newton, model, *arguments)
 
 
@@ -242,17 +227,17 @@ def passages(
     steps has its warm start.
     """
     positioned = fwd_position(model, template.replace(qpos=qpos))
-    guard = guard_at(model, positioned, closing, event)
-    forced = force_stage(model, positioned, qvel, act, control)
-    touching = guards.at_first_touch(model, forced, guard.touching)
+    found, own = guards.find_guards(model, positioned, closing, event.ends), event.guard
+    flags = (event.absent, event.touching & ~found.deep)
+    absent, touching = (each.astype(found.members.dtype) @ found.members for each in flags)
+    forced = guards.at_first_touch(model, force_stage(model, positioned, qvel, act, control), touching)
 
     def step(removed: Rows, warmstart: Qvel) -> tuple[Qvel, Qvel]:
-        prepared = guards.without(touching, removed)
+        prepared = guards.without(forced, removed)
         qacc = solver(model, prepared.replace(qacc_warmstart=warmstart))
         return advance_velocity(model, prepared, qacc)[0], qacc
 
-    on, off = step(guard.absent, warmstart[0]), step(guard.absent + guard.members, warmstart[1])
+    on, off = step(absent, warmstart[0]), step(absent + found.members[own], warmstart[1])
     qvel, qacc = (jnp.stack(each) for each in zip(on, off, strict=True))
-    damper, spring = guards.relaxation_rates(model, positioned.replace(qvel=closing), guard.weights)
-    rate = jnp.maximum(damper, spring)
-    return Passages(qvel, qacc, guard.normal, rate, spring, guard.deep)
+    damper, spring = guards.relaxation_rates(model, positioned.replace(qvel=closing), found.weights[own])
+    return Passages(qvel, qacc, found.slopes(own), jnp.maximum(damper, spring), spring, found.deep[own])

@@ -30,53 +30,52 @@ lacks is then taken too small. Bodies on several feet, each with noise of its ow
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation import guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
-from mjx_study.simulation.dynamics import Control, Controls, Qpos, State, entry_by_entry, fwd_position
+from mjx_study.simulation.dynamics import Control, Qpos, State, entry_by_entry, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.observed import (
     Known,
     Observed,
     Replay,
     along_events,
-    guard_at,
     known_step,
     least_travel,
     moving_values,
     over_events,
     tangent_of,
-    timestep_of,
 )
 from mjx_study.simulation.over_model import moved_by_model
 from mjx_study.simulation.scene import Scene
-from mjx_study.simulation.touch import Events, OnsetCounts, at_touch
+from mjx_study.simulation.touch import Events, Flags, OnsetCounts, at_touch
 
 
 def shifts(
     scene: Scene, model: mjx.Model, fixed_model: mjx.Model, seen: Observed, events: Events, weight: float | Scalar
 ) -> tuple[Replay, Scalar, Any, OnsetCounts]:
     """What `onset.corrected` needs of this term, as `saltation.saltation`; a is passed from step to step."""
-    timestep, step_length = timestep_of(scene, model), timestep_of(scene, fixed_model)
+    timestep, step_length = model.opt.timestep, fixed_model.opt.timestep
     before, controls, after, found = seen.before, seen.controls, seen.after, seen.found
     crossings = over_events(partial(_crossing_of, scene, fixed_model, before, after), events)
-    cells = _cells(crossings, events, before.qvel, step_length)
-    over_velocity = (1 - cells.since)[:, None] * crossings.normal
-    slopes = jnp.concatenate([crossings.normal, over_velocity, -cells.travel[:, None]], axis=1)
-    by_model = cells.rate * moved_by_model(scene, model, before, events)
+    travel, rate, valid, narrow = _cells(crossings, events, before.qvel, step_length)
+    over_velocity = (1 - crossings.since)[:, None] * crossings.normal
+    slopes = jnp.concatenate([crossings.normal, over_velocity, -travel[:, None]], axis=1)
+    by_model = rate * moved_by_model(scene, model, before, events)
     by_model = jnp.zeros(len(controls), by_model.dtype).at[events.step - 1].add(by_model)
 
     def replay(state: State, earlier: Scalar, control: Control, known: Known, row: Any) -> tuple[State, Scalar]:
-        (fixed, given, after), (own, of_model, near) = known, row
+        (fixed, given, after), (own, of_model, previous, subsequent, goes_on) = known, row
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
         moved = jnp.concatenate([moved, timestep * state.qvel - step_length * fixed.qvel, earlier[None]])
-        (change,) = tangent_of(along_events(cells.rate[:, None], slopes, own, moved))
+        (change,) = tangent_of(along_events(rate[:, None], slopes, own, moved))
         shift = earlier + change + of_model
         # halves of the differences to the step after and to the one before
-        ahead, behind = weight * near.ahead * shift / 2, weight * earlier / 2
+        ahead, behind = weight * goes_on * shift / 2, weight * earlier / 2
 
         def along(past: Array, here: Array, following: Array) -> Array:
             return ahead * (following - here) + behind * (here - past)
@@ -84,45 +83,27 @@ def shifts(
         way = -step_length * (ahead * after.qvel + behind * fixed.qvel)
         rest = (
             integrate_position(scene.host, state.qpos, way, 1.0),
-            state.qvel - along(near.qvel, fixed.qvel, after.qvel),
-            state.act - along(near.act, fixed.act, after.act),
-            control - along(near.control, given, near.next_control),
+            state.qvel - along(previous.before.qvel, fixed.qvel, after.qvel),
+            state.act - along(previous.before.act, fixed.act, after.act),
+            control - along(previous.control, given, subsequent.control),
         )
         point = moving_values((fixed.qpos, fixed.qvel, fixed.act, given), rest)
         qvel, act = known_step(scene, model, point, after)
-        qvel = qvel + along(fixed.qvel, after.qvel, near.next_qvel)
-        act = act + along(fixed.act, after.act, near.next_act)
+        qvel = qvel + along(fixed.qvel, after.qvel, subsequent.after.qvel)
+        act = act + along(fixed.act, after.act, subsequent.after.act)
         return State(integrate_position(scene.host, state.qpos, qvel, timestep), qvel, act, after.warmstart), shift
 
     own = tuple(jnp.append(jnp.minimum(each[1:], len(events.used)), 0) for each in (found.before, found.after))
-    rows = own, by_model, _neighbours(before, after, controls)
-    nothing = jnp.zeros_like(cells.rate)
-    counts = events.counts(seen.past, cells.valid, cells.narrow, nothing, nothing > 0)
-    return replay, jnp.zeros((), cells.rate.dtype), rows, counts
+    at = jnp.arange(len(controls))
 
+    def beside(number: int) -> Known:
+        """What is known of the step before or after each; of the first or last step itself where there is none."""
+        return jax.tree.map(lambda leaf: leaf[jnp.clip(at + number, 0, at[-1])], Known(before, controls, after))
 
-class Neighbours(NamedTuple):
-    """What precedes and follows each step.
-
-    Attributes:
-        qvel, act, control: before the preceding step, and its control; of the first step, its own.
-        next_qvel, next_act, next_control: after the following step, and its control; of the last step, its own.
-        ahead: 0 for the last step, otherwise 1.
-    """
-
-    qvel: Float[Array, "steps nv"]
-    act: Float[Array, "steps na"]
-    control: Float[Array, "steps nu"]
-    next_qvel: Float[Array, "steps nv"]
-    next_act: Float[Array, "steps na"]
-    next_control: Float[Array, "steps nu"]
-    ahead: Float[Array, " steps"]
-
-
-def _neighbours(before: State, after: State, controls: Controls) -> Neighbours:
-    earlier = [jnp.concatenate([leaf[:1], leaf[:-1]]) for leaf in (before.qvel, before.act, controls)]
-    later = [jnp.concatenate([leaf[1:], leaf[-1:]]) for leaf in (after.qvel, after.act, controls)]
-    return Neighbours(*earlier, *later, ahead=jnp.ones(len(controls), before.qvel.dtype).at[-1].set(0))
+    rows = own, by_model, beside(-1), beside(1), (at < at[-1]).astype(rate.dtype)
+    nothing = jnp.zeros_like(rate)
+    counts = events.counts(seen.past, valid, narrow, nothing, nothing > 0)
+    return replay, jnp.zeros((), rate.dtype), rows, counts
 
 
 class Crossing(NamedTuple):
@@ -153,31 +134,21 @@ def _crossing(
     """An event's crossing, from the state before its step and the accelerations in it and in the one before."""
     touch = at_touch(None, model, template, qpos, qvel, event)
     positioned = fwd_position(model, template.replace(qpos=touch.qpos))
-    guard = guard_at(model, positioned, qvel, event)
-    rate = jnp.maximum(*guards.relaxation_rates(model, positioned.replace(qvel=qvel), guard.weights))
-    least = least_travel(model, accelerations @ guard.normal, event.ends | guard.deep, rate)
-    return Crossing(guard.normal, jnp.clip(touch.share, 0, 1), touch.valid, least)
+    found, own = guards.find_guards(model, positioned, qvel, event.ends), event.guard
+    normal = found.slopes(own)
+    rate = jnp.maximum(*guards.relaxation_rates(model, positioned.replace(qvel=qvel), found.weights[own]))
+    least = least_travel(model, accelerations @ normal, event.ends | found.deep[own], rate)
+    return Crossing(normal, jnp.clip(touch.share, 0, 1), touch.valid, least)
 
 
-class Cells(NamedTuple):
-    """Widths of what events' touches are spread over.
+def _cells(
+    crossings: Crossing, events: Events, qvel: Float[Array, "steps nv"], timestep: Scalar
+) -> tuple[Array, Array, Flags, Flags]:
+    """Cells that events' touches are spread over, from the velocities before every step.
 
-    Attributes:
-        travel: D.
-        rate: 1 / D, of the cell's width, divided by the number of events in the step; 0 if the event is not valid.
-        since: s.
-        valid, narrow: whether D has the event's sign, and whether the cell counts as wider.
+    Returns D; 1 / D, of the cell's width, divided by the number of events in the step, 0 if the event is not valid;
+    whether D has the event's sign; and whether the cell counts as wider.
     """
-
-    travel: Float[Array, " slots"]
-    rate: Float[Array, " slots"]
-    since: Float[Array, " slots"]
-    valid: Bool[Array, " slots"]
-    narrow: Bool[Array, " slots"]
-
-
-def _cells(crossings: Crossing, events: Events, qvel: Float[Array, "steps nv"], timestep: float | Scalar) -> Cells:
-    """Cells from the velocities before every step."""
     at, sign = events.step - 1, jnp.where(events.ends, 1, -1)
     past, here, after = qvel[jnp.maximum(at - 1, 0)], qvel[at], qvel[events.step]
     between = (at > 0)[:, None]  # z before step k - 1, in which there is nothing behind the first
@@ -189,4 +160,4 @@ def _cells(crossings: Crossing, events: Events, qvel: Float[Array, "steps nv"], 
     width = jnp.where(valid, sign * jnp.maximum(jnp.abs(travel), crossings.least), 1.0)
     number = jnp.zeros(len(qvel), travel.dtype).at[at].add(valid)[at]
     rate = jnp.where(valid, 1 / (jnp.maximum(number, 1) * width), 0.0)
-    return Cells(travel, rate, crossings.since, valid, valid & (jnp.abs(travel) < crossings.least))
+    return travel, rate, valid, valid & (jnp.abs(travel) < crossings.least)

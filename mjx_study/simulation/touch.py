@@ -2,7 +2,7 @@
 
 import dataclasses
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Int8, Int32
 from estimators.pytree import register_pytree
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qpos, Qvel, Scalar, fwd_position
-from mjx_study.simulation.guards import Course, motion
+from mjx_study.simulation.guards import Course, find_guards
 from mjx_study.simulation.integration import integrate_position
 
 TOUCHING_SHARE: Final = 1e-6
@@ -26,9 +26,6 @@ CHATTER: Final = 2.2
 """Time between two events of a contact below which they belong together, in the time that contact takes to slow a body
 down, one over the larger of `guards.relaxation_rates`: a little more than `solref`'s time constant where damping is
 critical."""
-
-LONG_AGO: Final = 1_000_000  # steps before the first event of a contact
-
 
 Flags = Bool[Array, " slots"]
 
@@ -64,9 +61,7 @@ class OnsetCounts:
         return cls(zero, zero, zero, jnp.zeros((), dtype), jnp.full((), jnp.nan, dtype), zero)
 
 
-@register_pytree
-@dataclasses.dataclass(frozen=True)
-class Events:
+class Events(NamedTuple):
     """Steps at which a contact or limit begins, or ends while it exerts a force, earliest first.
 
     Attributes:
@@ -117,7 +112,7 @@ class Events:
 
         zeros = jnp.zeros(len(guards), self.step.dtype)
         events = self.step, self.guard.astype(zeros.dtype), self.used, rate
-        _, number = jax.lax.scan(forwards, (zeros - LONG_AGO, zeros), events)
+        _, number = jax.lax.scan(forwards, (zeros, zeros), events)
         _, length = jax.lax.scan(backwards, (zeros, zeros), (number, *events[1:3]), reverse=True)
         return self.used & (length >= LEAST)
 
@@ -140,9 +135,7 @@ class Events:
         return OnsetCounts(onsets + missed, jnp.sum(narrow), missed, strength, first, past.replaced)
 
 
-@register_pytree
-@dataclasses.dataclass(frozen=True)
-class Changes:
+class Changes(NamedTuple):
     """What begins and ends in a step, or in the steps of a rollout.
 
     Attributes:
@@ -161,9 +154,7 @@ _KINDS: Final = {"begins": 1, "ends": 2, "happens": 4, "under_force": 8, "brief"
 """Crossings that begin and end, events, those that end, and those of `Events.brief`."""
 
 
-@register_pytree
-@dataclasses.dataclass(frozen=True)
-class Past:
+class Past(NamedTuple):
     """What has to be known of the steps before one to tell its changes.
 
     Attributes:
@@ -199,6 +190,14 @@ def changes(here: Course, past: Past, timestep: float | Scalar) -> tuple[Past, C
     return following, Changes(crossing.since, jnp.asarray(kinds, jnp.int8), past.events, events)
 
 
+def event_of(found: Changes, number: Int[Array, ""], step: Int[Array, ""]) -> Events:
+    """The event of a step that has a number among those of the rollout."""
+    begins, ends, happens, under_force, brief = (found.kinds & jnp.int8(kind) != 0 for kind in _KINDS.values())
+    guard = jnp.argmax(jnp.cumsum(happens) > number - found.before)
+    others = Crossings(begins, ends, found.since).others(guard)
+    return Events(step, guard, under_force[guard], brief[guard], *others, number < found.after)
+
+
 def events_of(found: Changes, slots: int) -> Events:
     """The first events of a rollout.
 
@@ -209,19 +208,15 @@ def events_of(found: Changes, slots: int) -> Events:
     def next_event(step: Array, slot: Array) -> tuple[Array, Events]:
         later = lambda at: (at < len(found.after) - 1) & (found.after[at] <= slot)  # noqa: E731
         step = jax.lax.while_loop(later, lambda at: at + 1, step)
-        used, kinds = slot < jnp.minimum(found.after[-1], slots), found.kinds[step]
-        begins, ends, happens, under_force, brief = (kinds & jnp.int8(kind) != 0 for kind in _KINDS.values())
-        guard = jnp.argmax(jnp.cumsum(happens) > slot - found.before[step])
-        others = Crossings(begins, ends, found.since[step]).others(guard)
-        at = jnp.where(used, step, 1), jnp.where(used, guard, 0)
-        return step, Events(*at, under_force[guard], brief[guard], *others, used)
+        used = slot < jnp.minimum(found.after[-1], slots)
+        event = event_of(jax.tree.map(lambda leaf: leaf[step], found), slot, step)
+        at = jnp.where(used, step, 1), jnp.where(used, event.guard, 0)
+        return step, event._replace(step=at[0], guard=at[1], used=used)
 
     return jax.lax.scan(next_event, jnp.zeros((), jnp.int32), jnp.arange(max(slots, 1), dtype=jnp.int32))[1]
 
 
-@register_pytree
-@dataclasses.dataclass(frozen=True)
-class Crossings:
+class Crossings(NamedTuple):
     """Guards that pass zero between two steps, along straight lines.
 
     Attributes:
@@ -285,9 +280,7 @@ def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "
     return (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING_SHARE * travel)
 
 
-@register_pytree
-@dataclasses.dataclass(frozen=True)
-class Touch:
+class Touch(NamedTuple):
     """Where the distance of a guard passes zero within the step before k.
 
     Attributes:
@@ -322,8 +315,8 @@ def at_touch(_: Any, model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qve
         return integrate_position(model, qpos, qvel, -timestep * back)
 
     def stage(back):
-        distance, speed = motion(model, fwd_position(model, template.replace(qpos=position(back))), qvel, ends)
-        return distance[guard], timestep * speed[guard]
+        found = find_guards(model, fwd_position(model, template.replace(qpos=position(back))), qvel, ends)
+        return found.distance[guard], timestep * found.speed[guard]
 
     def since(distance: Array, travel: Array, curvature: Array) -> tuple[Array, Array]:
         """Share of a step since the distance was zero, and the travel at that time."""
