@@ -9,16 +9,21 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.results.findings import ERROR_PER_STRENGTH
+from mjx_study.simulation import drop_in
+from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact, contact_model
 from mjx_study.simulation.dynamics import initial_state, rollout
+from mjx_study.simulation.observation import observed
+from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
-from tests.scenes import DROP, corrected_rollout, floor_scene, option, run, scene_of
+from tests.scenes import DROP, FALLING, corrected_rollout, floor_scene, option, run, scene_of
 
 TIMECONST, LOW, HIGH, WIDTH = 0.02, 0.9, 0.95, 0.001
 SPEED, GRAVITY = -1.7, -9.81
@@ -340,6 +345,40 @@ def test_grazing_onsets_do_not_spoil_the_mean() -> None:
     assert np.abs(found.first - found.slope) < 0.02 * np.abs(found.slope) + 2 * (found.first_error + found.slope_error)
     assert found.first_error < 0.02 * np.abs(found.slope)
     assert deviation < 0.012  # ZoBG's is 0.010; without the bound 0.75
+
+
+@pytest.mark.parametrize("onset", ["linear", "shift"])
+def test_a_model_of_another_timestep_has_its_own(onset: str) -> None:
+    short, long = (scene_of(floor_scene(DROP, option(step), 'condim="1"')) for step in (2e-3, 4e-3))
+
+    def gradients(speed):
+        def last(speed, scene):
+            start = dataclasses.replace(initial_state(scene, jnp.array([0.05])), qvel=speed)
+            return corrected_rollout(scene, long.model, start, LAW, 20, onset=onset)[0].qpos[-1, 0]
+
+        return [jax.grad(last)(speed, scene) for scene in (short, long)]
+
+    found, expected = run(gradients, jnp.array([SPEED]))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_without_constraints_there_is_no_term() -> None:
+    """MJX then has contacts, but no rows of theirs."""
+    host = mujoco.MjModel.from_xml_string(FALLING)
+    scene = put_scene(host, "ball", disable_flags="constraint")
+    model, data = mjx.put_model(scene.host), mjx.make_data(scene.host)
+    start = initial_state(scene)
+
+    def by_scene(qvel):
+        state = dataclasses.replace(start, qvel=qvel)
+        return corrected_rollout(scene, scene.model, state, LAW, 2)[0].qpos[-1, 0]
+
+    def by_step(qvel):
+        return drop_in.step(model, data.replace(qvel=qvel), onset="linear").qpos[0]
+
+    for function in (by_scene, by_step):
+        assert jax.eval_shape(jax.grad(function), start.qvel).shape == (1,)
+    np.testing.assert_array_equal(observed(scene, start).contact_force(0, 1), np.zeros(3))
 
 
 def test_onsets_beyond_the_slots_are_counted_and_left_out() -> None:

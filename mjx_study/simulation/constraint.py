@@ -11,7 +11,7 @@ the implicit function theorem: one symmetric positive definite system in `dG/da 
 its budget. The derivative is only as good as the solver's convergence, which `residual` measures and every result
 reports.
 
-MJX's constraint rows are private (`Data._impl.efc_*`) and are read only here and in `guards`.
+MJX's constraint rows are private (`Data._impl.efc_*`) and are read only in this package, and by gradcheck.
 """
 
 from collections.abc import Callable
@@ -133,6 +133,8 @@ def contact_forces(model: mjx.Model, data: mjx.Data) -> tuple[Int[Array, "contac
     """
     rows: Any = data._impl
     contact, forces = rows.contact, []
+    if not (len(contact.dim) and num_constraint_rows(data)):  # none where constraints are disabled
+        return jnp.zeros((0, 2), int), jnp.zeros((0, 3), data.qpos.dtype)
     for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
         edges = 2 * (condim - 1) if condim > 1 and model.opt.cone != ELLIPTIC else 0
         force = rows.efc_force[int(address) : int(address) + (edges or int(condim))]
@@ -140,8 +142,6 @@ def contact_forces(model: mjx.Model, data: mjx.Data) -> tuple[Int[Array, "contac
             plus, minus = force[::2], force[1::2]
             force = jnp.concatenate([jnp.sum(force)[None], contact.friction[index, : condim - 1] * (plus - minus)])
         forces.append(force[:3] @ contact.frame[index][: len(force[:3])])
-    if not forces:
-        return jnp.zeros((0, 2), int), jnp.zeros((0, 3), data.qpos.dtype)
     return contact.geom, jnp.stack(forces)
 
 
@@ -210,7 +210,8 @@ def newton(model: mjx.Model, data: mjx.Data) -> Qvel:
         return qacc, carry[1] + 1, unsolved(qacc)
 
     acting = jnp.any(force(slack_at(data.qacc_smooth)) != 0)
-    start = jnp.where(acting, data.qacc_warmstart, data.qacc_smooth)
+    warm = acting & jnp.all(jnp.isfinite(data.qacc_warmstart))  # of a state that has diverged and was reset it is not
+    start = jnp.where(warm, data.qacc_warmstart, data.qacc_smooth)
     return jax.lax.while_loop(lambda carry: carry[2] & (carry[1] < NEWTON_STEPS), again, (start, 0, acting))[0]
 
 

@@ -72,7 +72,7 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
             "the onset term is that of steps by Euler or implicitfast; with RK4, contact begins within a step"
         )
     with patched(_SOLVE):
-        if onset == "none":
+        if onset == "none" or not guards.num_guards(data):
             following = _uncorrected_step(model, data)
         else:
             traced, whole = traced_part(model)
@@ -220,8 +220,6 @@ def _step_terms(
     """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins or ends; see `onset_term`."""
     here = entry_by_entry(_course_here, model, data)
     empty = jnp.zeros((model.nv, model.nv + sum(leaf.size for leaf in moving.values())), data.qvel.dtype)
-    if not here.distance.size:
-        return empty, empty
     found = changes(here, preceding, model.opt.timestep)[1]
     states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
 

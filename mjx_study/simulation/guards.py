@@ -45,9 +45,9 @@ class Guards(NamedTuple):
 
 
 def num_guards(data: mjx.Data) -> int:
-    """Number of limits and contacts."""
+    """Number of limits and contacts; none where constraints are disabled."""
     rows: Any = data._impl
-    return int(rows.nl) + len(rows.contact.dim)
+    return int(rows.nl) + len(rows.contact.dim) if num_constraint_rows(data) else 0
 
 
 def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
