@@ -1,7 +1,7 @@
 """The terms that stand in for MJX's have its values, and the derivatives that its own lack."""
 
 import threading
-from typing import Any
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -163,6 +163,36 @@ def test_tendon_springs_are_linear_at_rest() -> None:
     program = jax.jit(jax.value_and_grad(force))
     assert [float(part) for part in program(jnp.zeros(()))] == [0.0, -400.0]
     assert [float(part) for part in program(jnp.array(0.1))] == [-40.0, -400.0]
+
+
+RING: Final = """<mujoco><worldbody><geom name="ring" type="cylinder" size=".1 .5" contype="0"/><site name="side"/>
+<site name="a" pos=".2 {height} 0"/><body pos="-.2 .03 0"><joint type="slide" axis="0 1 0"/><geom size=".01" mass="1"/>
+<site name="b"/></body></worldbody><tendon><spatial><site site="a"/><geom geom="ring" sidesite="side"/><site site="b"/>
+</spatial></tendon></mujoco>"""
+
+
+@pytest.mark.parametrize("bits", [32, 64])
+@pytest.mark.parametrize("height", [0.02, 0.15], ids=["straight", "wrapped"])
+def test_tendons_inside_a_ring_have_derivatives(height: float, bits: int) -> None:
+    """Whether they touch it or pass through; by the tape, which computes the branch that is not taken, too."""
+    with jax.enable_x64(bits == 64):
+        host = mujoco.MjModel.from_xml_string(RING.format(height=height))
+        model, data = mjx.put_model(host), mjx.make_data(host)
+
+        def length(y: jax.Array) -> jax.Array:
+            moved = mjx.kinematics(model, data.replace(qpos=y[None]))
+            with patches.patched():
+                return mjx.tendon(model, mjx.com_pos(model, moved)).ten_length[0]
+
+        y = 0.12 if height > 0.1 else 0.0
+        reverse = jax.jit(jax.grad(length))(jnp.array(y))
+        moved = []
+        for qpos in (y + 1e-6, y - 1e-6):
+            there = mujoco.MjData(host)
+            there.qpos[:] = qpos
+            mujoco.mj_forward(host, there)
+            moved.append(there.ten_length[0])
+        np.testing.assert_allclose(reverse, (moved[0] - moved[1]) / 2e-6, rtol=1e-4)
 
 
 @pytest.mark.parametrize("place", ["inside", "outside", "edge", "above", "axis", "middle"])

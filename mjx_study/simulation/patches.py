@@ -22,7 +22,7 @@ from mjx_study.simulation.integration import rotate_quaternion, rotation_between
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED, cholesky, solve_factored, solve_positive_definite
 
 _REFSAFE: Final = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
-_UNSEEN: Final = 1e-30  # [m]; its square is still a normal number
+_UNSEEN: Final = 1e-18  # [m]; its square is still a normal number, of 32 bits, too
 
 
 def stiffness_damping_impedance(
@@ -122,14 +122,20 @@ def contacts_with_friction(model: mjx.Model, data: mjx.Data) -> dict[Any, Any]:
     }
 
 
-def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]]:
+def wrap_inside(
+    end: Float[Array, " 4"], radius: Float[Array, ""], *rest: Any
+) -> tuple[Float[Array, " 1"], Float[Array, " 4"]]:
     """MJX's path of a tendon inside a sphere or cylinder: (length along it or -1, contact points).
 
     The length is always 0; MJX takes the square root of its square, which has no derivative at 0. Here it is negligibly
-    small instead, and differentiable.
+    small instead, and differentiable. Where the tendon does not wrap, MJX's search ends in NaN, which reverse mode
+    would spread: there it is given ends between which a tendon does.
     """
-    length, points = _ORIGINAL["support", "wrap_inside"](*arguments)
-    return jnp.where(length < 0, length, _UNSEEN), points
+    original = _ORIGINAL["support", "wrap_inside"]
+    wraps = original(end, radius, *rest)[0] >= 0
+    elsewhere = 2 * radius * jnp.array([-1.0, 1.0, 1.0, 1.0], end.dtype)
+    _, points = original(jnp.where(wraps, end, elsewhere), radius, *rest)
+    return jnp.where(wraps, _UNSEEN, -1.0), jnp.where(wraps, points, 0.0)
 
 
 def cylinder_distance(position: Float[Array, " 3"], size: Float[Array, " 3"]) -> Float[Array, ""]:
