@@ -114,6 +114,9 @@ def test_refsafe_clips_at_two_timesteps(normal_acceleration) -> None:
     limit = 2 * scene.timestep
     with pytest.warns(ContactWarning, match=r"refsafe clips the time constant 0.003 s at two timesteps, 0.004 s"):
         clipped = contact_model((0.75 * limit, 4.0), constant(0.8), scene=scene)
+    with pytest.warns() as told:
+        contact_model((limit / 4, 1.0), scene=scene)
+    assert len(told) == 1  # stable as clipped
     safe = contact_model((limit, 4.0), constant(0.8), scene=scene)
     assert acceleration(clipped, SPEED, 0.0) == acceleration(safe, SPEED, 0.0)
     contact_model((0.009, 1.0), scene=load_scene("pusher"))  # refsafe is off there; warnings are errors here
@@ -235,6 +238,8 @@ def test_every_family_builds(name: str) -> None:
                 family_model(name, scene, effective_mass=mass, **given)  # type: ignore[arg-type]
         return
     contact = family_model(name, scene, stiffness=100.0, effective_mass=mass)
+    with pytest.raises(ValueError, match="stiffness must be positive and finite, in N/m; got 0.0"):
+        family_model(name, scene, stiffness=0.0, effective_mass=mass)
     if family.smoothing:  # another law: its stiffness is measured in test_law
         return
     stiffness, damping = stiffness_from_solref(np.asarray(contact.solref).tolist(), effective_mass=mass)

@@ -271,6 +271,23 @@ def test_states_are_pytrees() -> None:
     assert jax.tree.map(lambda leaf: leaf, state).scene is scene
 
 
+def test_a_state_outlives_the_programs_that_ask_it() -> None:
+    """Quantities computed in a program, or in a branch of it, stay there; others are kept."""
+    scene = scene_of("elliptic")
+    state = generic(scene)[0]
+    target, known = observed(scene, state), observed(scene, state).xpos
+
+    def cost(height: jax.Array) -> jax.Array:
+        seen = observed(scene, dataclasses.replace(state, qpos=state.qpos.at[-1].add(height)))
+        inside = jax.lax.cond(height > 0, lambda: seen.xpos, lambda: target.xpos)
+        assert not {"xpos"} & {*vars(seen), *vars(target)}
+        return jnp.sum(inside + 0 * seen.xpos) * ("xpos" in vars(seen))
+
+    for height in (0.0, 0.5):
+        np.testing.assert_allclose(jax.jit(cost)(height), jnp.sum(known) + height, rtol=1e-12)
+    assert np.array_equal(target.xpos, known) and "xpos" in vars(target)
+
+
 def test_what_a_state_lacks_has_one_line() -> None:
     scene = scene_of("elliptic")
     state, control = generic(scene)
@@ -284,7 +301,9 @@ def test_what_a_state_lacks_has_one_line() -> None:
             ask()
     both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, control))
     with pytest.raises(ValueError, match=r"contact_force is computed for single states: map over them with jax.vmap"):
-        observed(scene, both[0], None, both[1]).contact_force(0, 1)
+        observed(scene, both[0], None, both[1]).contact_force("box", "floor")
+    with pytest.raises(ValueError, match="geoms 0 and 1 never collide: they are excluded, fixed to each other"):
+        observed(scene, state, None, control).contact_force(0, 1)
     with pytest.raises(SceneError, match="has no body 'lod'; did you mean load"):
         scene.body("lod")
     with pytest.raises(SceneError, match="has no site 'top'"):

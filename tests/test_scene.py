@@ -71,10 +71,10 @@ def test_enumerated_options_reach_mjx(option: str, values: tuple[str, ...], tmp_
 
 
 def test_numeric_options_reach_mjx() -> None:
-    scene = load_scene("pusher", timestep=0.0025, iterations=7, ls_iterations=9, tolerance=1e-6)
+    scene = load_scene("pusher", timestep=np.float32(0.0025), iterations=np.int64(7), ls_iterations=9, tolerance=1e-6)
     option = scene.model.opt
     assert (option.iterations, option.ls_iterations) == (7, 9)
-    assert float(option.timestep) == scene.timestep == 0.0025
+    assert float(option.timestep) == scene.timestep == np.float32(0.0025)
     assert float(option.tolerance) == 1e-6
 
 

@@ -97,8 +97,7 @@ def contact_model(
         raise ValueError(f"friction must be three numbers >= 0 (sliding, torsional, rolling), got {tuple(friction)}")
     if margin is not None and not margin >= 0:
         raise ValueError(f"margin must be >= 0 m, got {margin}")
-    _warn_if_clipped(solref, scene)
-    _warn_if_unstable(solref, scene.timestep)
+    _warn_if_unstable(_as_clipped(solref, scene), scene.timestep)
     as_array = partial(jnp.asarray, dtype=scene.template.qpos.dtype)
     return ContactModel(
         as_array(solref),
@@ -148,6 +147,7 @@ def family_model(
     elif stiffness is None:
         raise ValueError(f"contact family {name!r} needs a stiffness in N/m")
     elif law is not None:
+        solref_from_stiffness(stiffness, damping, effective_mass=effective_mass)  # checks them
         solref = law.solref(stiffness, damping, effective_mass=effective_mass, d_width=family.solimp[1], edges=edges)
     else:
         dampratio = family.dampratio if damping is None else None
@@ -196,14 +196,14 @@ def stiffness_from_solref(solref: Sequence[float], *, effective_mass: float) -> 
     return effective_mass / (first * second) ** 2, 2 * effective_mass / first
 
 
-def contact_pair(scene: Scene, geom1: str, geom2: str) -> ContactPair:
-    """The contact of two geoms given by name, in either order.
+def contact_pair(scene: Scene, geom1: str | int, geom2: str | int) -> ContactPair:
+    """The contact of two geoms given by names or indices, in either order.
 
     Raises:
         SceneError: unknown geom name.
         ValueError: the geoms are never tested for collision.
     """
-    geoms = {scene.geom(geom1), scene.geom(geom2)}
+    geoms = {scene.geom(geom) if isinstance(geom, str) else geom for geom in (geom1, geom2)}
     for pair in contact_pairs(scene.host):
         if {pair.first, pair.second} == geoms:
             return pair
@@ -322,15 +322,18 @@ def _check_solimp(solimp: Sequence[float]) -> None:
         raise ValueError(f"solimp's power must be at least 1, got {solimp[4]}")
 
 
-def _warn_if_clipped(solref: Sequence[float], scene: Scene) -> None:
+def _as_clipped(solref: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
+    """The solref that acts, with a warning if `refsafe` clips it."""
     refsafe = not scene.host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
-    if refsafe and 0 < solref[0] < 2 * scene.timestep:
-        warnings.warn(
-            f"refsafe clips the time constant {solref[0]:g} s at two timesteps, {2 * scene.timestep:g} s; disable the "
-            "flag refsafe in the MJCF, or give a negative solref (-k, -b), which is never clipped",
-            ContactWarning,
-            stacklevel=3,
-        )
+    if not (refsafe and 0 < solref[0] < 2 * scene.timestep):
+        return solref
+    warnings.warn(
+        f"refsafe clips the time constant {solref[0]:g} s at two timesteps, {2 * scene.timestep:g} s; disable the "
+        "flag refsafe in the MJCF, or give a negative solref (-k, -b), which is never clipped",
+        ContactWarning,
+        stacklevel=3,
+    )
+    return (2 * scene.timestep, solref[1])
 
 
 def stable(solref: Sequence[float], timestep: float) -> bool:

@@ -22,7 +22,7 @@ from estimators.choices import suggestion
 from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.contact import ContactModel, apply_contact, has_mujoco_law
+from mjx_study.simulation.contact import ContactModel, apply_contact, contact_pair, has_mujoco_law
 from mjx_study.simulation.dynamics import Act, Control, Qpos, State, acceleration, entry_by_entry, smooth_stages
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
@@ -93,12 +93,18 @@ class ObservedState(State):
             known = ["qpos", "qvel", "act", *QUANTITIES]
             raise AttributeError(f"a state has {', '.join(known)}, but no {name!r}{suggestion(name, known)}")
         found = self._sensors() if name == "sensordata" else self._motion(name)
-        object.__setattr__(self, name, found)  # so that it is computed once
+        traces = {_trace_of(leaf) for leaf in jax.tree.leaves(self)}
+        if _trace_of(found) in {None, *traces}:  # otherwise it is of a program that this state outlives
+            object.__setattr__(self, name, found)  # so that it is computed once
         return found
 
     def contact_force(self, first: str | int, second: str | int) -> Float[Array, " 3"]:
-        """Force [N] of the second geom on the first, given by names or indices, in the world frame."""
+        """Force [N] of the second geom on the first, given by names or indices, in the world frame.
+
+        ValueError if the two are never tested for collision.
+        """
         one, other = (self.scene.geom(geom) if isinstance(geom, str) else int(geom) for geom in (first, second))
+        contact_pair(self.scene, one, other)  # which refuses those that never collide
         return self._forced("contact_force", partial(_contact_force, (one, other)))
 
     def _motion(self, name: str) -> Float[Array, "..."]:
@@ -147,6 +153,11 @@ def observed(
 ) -> ObservedState:
     """Return a state of a scene with its `QUANTITIES`; see `ObservedState` for the arguments."""
     return ObservedState(state.qpos, state.qvel, state.act, state.warmstart, scene, contact, control)
+
+
+def _trace_of(value: Any) -> Any:
+    """The trace that a value belongs to; None of an array."""
+    return getattr(value, "_trace", None)
 
 
 @jax.jit

@@ -28,7 +28,8 @@ _ENUMERATED: Final = {
     "solver": {name: mujoco.mjtSolver.__members__[f"mjSOL_{name.upper()}"] for name in SOLVERS},
     "integrator": {name: mujoco.mjtIntegrator.__members__[f"mjINT_{name.upper()}"] for name in INTEGRATORS},
 }
-SceneOption = str | float | int | Sequence[str]
+Number = float | int | np.integer | np.floating
+SceneOption = str | Number | Sequence[str]
 ADJOINTS: Final = ("auto", "graph", "tape")
 """Ways to differentiate steps (see `Scene.adjoint`)."""
 _POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
@@ -58,7 +59,7 @@ class Scene:
               each step again (fault 13 in `docs/gradient-faults.md`).
             - "auto": graphs in native code, and up to `MOST_UNROLLED` degrees of freedom; else the tape.
 
-            Derivatives with respect to the model always use the tape.
+            Derivatives with respect to the model use the tape, but for contact laws other than MuJoCo's.
 
     Raises:
         SceneError: unknown adjoint.
@@ -293,7 +294,7 @@ def _set_options(host: mujoco.MjModel, options: Mapping[str, SceneOption]) -> No
             setattr(host.opt, name, choices[str(value)])
         elif name in _POSITIVE:
             number_type = type(getattr(host.opt, name))
-            if not isinstance(value, float | int) or not (0 < value < math.inf and number_type(value) == value):
+            if not isinstance(value, Number) or not (0 < value < math.inf and number_type(value) == value):
                 whole = "whole " if number_type is int else ""
                 raise SceneError(f"{name} must be a positive {whole}number, got {value!r}")
             setattr(host.opt, name, number_type(value))
@@ -304,7 +305,7 @@ def _set_options(host: mujoco.MjModel, options: Mapping[str, SceneOption]) -> No
 
 
 def _disable_flags(host: mujoco.MjModel, names: SceneOption) -> None:
-    if isinstance(names, float | int):
+    if isinstance(names, Number):
         raise SceneError(f"disable_flags must be names of flags, got {names!r}")
     for name in names.split(",") if isinstance(names, str) else names:
         if name not in FLAGS:
