@@ -263,6 +263,16 @@ def test_corners_that_replace_each_other_are_counted(second: list[float], travel
     assert replaced_points(here, before, timestep) == number
 
 
+def test_corners_at_a_plane_that_replace_each_other_are_counted() -> None:
+    """Of three corners one stays, one vanishes and one appears in penetration; MJX's contacts are no guards then."""
+    gone, came = (jnp.array([*corners, 1.0, 1.0]) for corners in ([-0.1, -0.1, 0.0], [-0.1, 0.0, -0.1]))
+    points = guards.Points(jnp.zeros((2, 3)), jnp.full(2, 0.01), jnp.tile(jnp.array([0, 1]), (2, 1)))
+    here, before = (guards.Course(each, 0 * each, each, 0 * each, each < 0, points) for each in (came, gone))
+    assert replaced_points(here, before, 0.01) == 2
+    sinking = here._replace(speed=jnp.array([0.0, 0.0, -6.0, 0.0, 0.0]))
+    assert replaced_points(sinking, before, 0.01) == 1  # the new one has passed zero by motion
+
+
 def test_a_sphere_that_meets_a_cylinder_replaces_no_point() -> None:
     """It moves on circles, so that its distance passes zero where the tangent of its path does not: 2 % of such events
     had been taken for corners."""

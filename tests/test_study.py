@@ -282,7 +282,10 @@ def as_json(dataset: xr.Dataset) -> dict[str, Any]:
 
 
 def test_warnings_name_what_must_not_be_overlooked() -> None:
-    told = warnings_of(result(row("fobg", 10, 1, nonfinite=7), row("zobg", 10, 1, unconverged=3, residual=0.2)))
+    some = {"unconverged": 3, "residual": 0.2, "onsets": 8, "onsets_bounded": 10, "onsets_missed": 2}
+    told = warnings_of(result(row("fobg", 10, 1, nonfinite=7), row("zobg", 10, 1, **some)))
+    assert "10 onsets and ends of contact are grazing, and their terms are bounded" in told  # not among onsets alone
+    assert any(each.startswith("2 events of contact have no term") and "(8 onsets in all)" in each for each in told)
     assert any(line.startswith("7 samples overflowed or became NaN and were left out, ") for line in told)
     assert "3 rollouts in which the contact solver did not converge" in told
 

@@ -84,7 +84,7 @@ GRADIENTS: Final = {
     "unconverged": Variable(EACH, "1", "rollouts whose solver residual is too large", digits=0),
     "seconds_per_sample": Variable(EACH, "s", "computing time of one sample, without compilation", "ms", 2, 1e3),
     "onsets": Variable(EACH, "1", "onsets of contact in the first-order batches", digits=0),
-    "onsets_bounded": Variable(EACH, "1", "onsets at grazing speed, with a bounded term", digits=0),
+    "onsets_bounded": Variable(EACH, "1", "onsets and ends at grazing speed, with a bounded term", digits=0),
     "onsets_missed": Variable(
         EACH, "1", "events without a term: of chattering contacts, or beyond the slots", digits=0
     ),

@@ -71,12 +71,13 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
         "rollouts have too many",
         "onsets_replaced": "contact points of corners or edges appear or vanish in penetration and have no term: "
         "means with the onset term may be off",
-        "onsets_bounded": "onsets of contact are grazing, and their terms are bounded",
+        "onsets_bounded": "onsets and ends of contact are grazing, and their terms are bounded",
     }
     counts = {name: total(dataset[name]) for name in counted if name in dataset}
     found += lost_samples(dataset)
     among = f" ({total(dataset['onsets'])} onsets in all)" if "onsets" in dataset else ""
-    found += [f"{count} {counted[name]}{among * ('onset' in name)}" for name, count in counts.items() if count]
+    of_onsets = ("onsets_missed", "onsets_replaced")
+    found += [f"{count} {counted[name]}{among * (name in of_onsets)}" for name, count in counts.items() if count]
     if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
         found.append(
             f"fewer than {ENOUGH_EFFECTIVE:g} effective samples in batches: {few}; do not trust their errors, "

@@ -41,7 +41,7 @@ class OnsetCounts:
         missed: events left uncorrected, for lack of slots or because their contact chatters (`Events.chattering`).
         strength: root-mean-square share of the approach speed that a corrected onset removes in one step, by the force
             at touch or by the spring at the depth of a step, h^2 k d_0 / d_width, whichever is more; 0 if there is
-            none, and with the jump, whose error does not depend on it.
+            none, and with shifts, whose error does not depend on it.
         first: step of the first onset; NaN if there is none.
         replaced: contact points of corners and edges that appear or vanish without their distance passing zero, for
             which there is no term.
@@ -65,7 +65,7 @@ class Events(NamedTuple):
     """Steps at which a contact or limit begins, or ends while it exerts a force, earliest first.
 
     Attributes:
-        step, guard: index of the step and of the contact or limit, as in `guards.guard_rows`.
+        step, guard: index of the step and of the guard, as in `guards.Guards`.
         ends: whether it ends at that step; otherwise it begins.
         brief: whether the gap before it, or the contact that ends, lasted one step.
         absent: guards that begin later in the step, or have ended earlier in it.
@@ -266,13 +266,16 @@ def replaced_points(here: Course, preceding: Course, timestep: float | Scalar) -
     deep = here.distance < -SPARE * timestep * jnp.abs(here.speed)
     deep_before = preceding.pushes & (preceding.room < -SPARE * timestep * jnp.abs(preceding.leaving))
     flags = here.distance < 0, preceding.distance < 0, deep, deep_before
-    touching, touched, deep, deep_before = (each[-len(points.reach) :] for each in flags)
+    split = len(here.distance) - len(points.reach)
+    touching, touched, deep, deep_before = (each[:split] for each in flags)  # limits, and corners at planes
+    corners = jnp.sum(touching & deep & ~touched) + jnp.sum(touched & deep_before & ~touching)
+    touching, touched, deep, deep_before = (each[split:] for each in flags)
     same = jnp.all(points.geom[:, None] == others.geom[None], axis=-1) & touching[:, None] & touched[None]
     moved = jnp.linalg.norm(points.place[:, None] - others.place[None], axis=-1)
     near = same & (moved <= jnp.maximum(points.reach[:, None], others.reach[None]))
     appear = touching & deep & ~jnp.any(near, axis=1)
     vanish = touched & deep_before & ~jnp.any(near, axis=0)
-    return jnp.sum(appear) + jnp.sum(vanish)
+    return corners + jnp.sum(appear) + jnp.sum(vanish)
 
 
 def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "*steps guards"]) -> Bool[Array, "..."]:
