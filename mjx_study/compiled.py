@@ -243,7 +243,7 @@ class Compiled:
         def export() -> Callable[..., Any] | None:
             try:
                 program = jax.export.export(jitted, disabled_checks=_CallingAny())(*types)
-            except ValueError:  # an operation that cannot be exported
+            except (ValueError, NotImplementedError):  # an operation that cannot be exported
                 return None
             called = libraries_in(program.mlir_module_serialized)
             trace = dataclasses.replace(program, disabled_safety_checks=_calling(called)).serialize()

@@ -269,6 +269,18 @@ def test_outputs_of_a_class_that_cannot_be_pickled_are_traced_anew(folder: Path)
     assert len(list(folder.glob("*.trace"))) == 1
 
 
+def test_functions_that_call_back_are_traced_anew(folder: Path, capfd: pytest.CaptureFixture[str]):
+    """JAX cannot serialise them."""
+
+    def printing(x: Any) -> Any:
+        jax.debug.print("called with {}", x)
+        return 2 * x
+
+    assert Compiled(printing, "own")(1.0) == 2.0 and not list(folder.glob("*.trace"))
+    jax.effects_barrier()
+    assert capfd.readouterr().out == "called with 1.0\n"
+
+
 def test_names_say_which_settings_do_not_count():
     left_out = [name for name in jax.config.values if compiled.UNTRACED.search(name)]
     assert not [

@@ -132,6 +132,9 @@ FUNCTIONS = {
     "loop of known length": descent,
     "loop of known length of members": lambda x: jax.vmap(descent)(_members(x)),
     "loop of known length in another": _descent_in_descent,
+    "passes that stack scalars": lambda x: jnp.min(jax.lax.map(lambda w: (x[0] - w) ** 2, jnp.asarray(TABLE[:, 1]))),
+    "passes of scalars": lambda x: jax.lax.scan(lambda y, row: (y + jnp.sum(jnp.full(3, row)), y), 0.0, x),
+    "passes that give what they get": lambda x: jax.lax.scan(lambda y, row: (y, row), x[0], x),
     "recomputed": lambda x: jax.checkpoint(lambda y: jnp.sin(y) * jax.checkpoint(jnp.cumsum)(y + TABLE[0, 0]))(x),
     "loop of no step": lambda x: jax.lax.fori_loop(0, 0, lambda _, y: y * 2, x),
     "empty": lambda x: (x[:0], jnp.sum(x[:0]), jnp.zeros((0, 3)) @ x, jnp.zeros((2, 0)) @ x[:0]),
@@ -177,8 +180,9 @@ def test_the_value_is_the_functions(name, monkeypatch):
 @pytest.mark.parametrize(
     "name",
     ["elementwise", "computed index", "computed indices of large arrays", "add to one place twice", "products",
-     "products of what is computed", "sums", "sums along any axis", "reductions", "recomputed", "loop of known length",
-     "loop of known length of members", "loop of known length in another"],
+     "products of what is computed", "sums", "sums along any axis", "reductions", "passes that stack scalars",
+     "passes of scalars", "recomputed", "loop of known length", "loop of known length of members",
+     "loop of known length in another"],
 )  # fmt: skip
 def test_both_modes_differentiate_it(name):
     def total(function, x):
@@ -290,6 +294,27 @@ def test_a_sum_of_zeros_is_not_negative(function, native, monkeypatch):
     found, slopes = jax.jit(jax.vmap(jax.value_and_grad(lambda x: unrolled(function, x))))(points)
     np.testing.assert_allclose(found, jax.vmap(function)(points), rtol=1e-12)
     np.testing.assert_allclose(slopes[2], jax.grad(function)(points[2]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("native", ROUTES, ids=ROUTES.get)
+def test_a_function_with_side_effects_is_left_as_it_is(native, monkeypatch, capfd):
+    monkeypatch.setenv(SWITCH, native)
+
+    def printing(x):
+        jax.debug.print("called with {}", x)
+        return 2 * x
+
+    assert jax.jit(lambda x: unrolled(printing, x))(1.0) == 2.0
+    jax.effects_barrier()
+    assert capfd.readouterr().out == "called with 1.0\n"
+
+
+@pytest.mark.parametrize("native", ROUTES, ids=ROUTES.get)
+def test_random_keys_stay_with_jax(native, monkeypatch):
+    monkeypatch.setenv(SWITCH, native)
+    function = lambda x: x + jax.random.normal(jax.random.key(0), (3,))  # noqa: E731
+    with jax.debug_key_reuse(False):  # which takes the stacking of a key's entries for a use
+        np.testing.assert_allclose(jax.jit(lambda x: unrolled(function, x))(ROW), function(ROW), rtol=1e-15)
 
 
 def test_values_alone_can_be_too_large(monkeypatch):

@@ -141,6 +141,18 @@ def random(fixed, start, rows):
     return lax.scan(step, jax.random.key(0), rows)[1]
 
 
+def seeded(fixed, start, rows):
+    return lax.scan(lambda x, row: (x + row * jax.random.normal(jax.random.key(0)), None), start, rows)
+
+
+def printing(fixed, start, rows):
+    def body(x, row):
+        jax.debug.print("{}", row[0])
+        return x + row, None
+
+    return lax.scan(body, start, rows)
+
+
 def long(fixed, start, rows):
     return lax.scan(lambda x, row: (x + jnp.sum(jnp.outer(jnp.sin(row), jnp.arange(1, 900.0))), None), start, rows)
 
@@ -163,6 +175,8 @@ def test_loops_without_passes_or_results():
     [
         (whole_array, "loop with values of type complex128"),
         (random, "loop over random keys"),
+        (seeded, "loop with random_seed"),
+        (printing, "loop with side effects"),
         (long, "loop of more than 1000 operations"),
         (wide, "loop of more than 500 values from pass to pass"),
     ],

@@ -19,6 +19,7 @@ from mjx_study.graph.nodes import (
     LoopBody,
     Node,
     ScalarGraph,
+    SideEffectsError,
     TooLargeError,
     collection_paused,
     constants,
@@ -140,8 +141,11 @@ def capture(function: Callable[..., Any], *arguments: Any, most: int, values_onl
 
     Raises:
         TooLargeError: it has more operations.
+        SideEffectsError: it prints, for example, which a graph cannot.
     """
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    if jaxpr.effects:
+        raise SideEffectsError
     if _entries(jaxpr.jaxpr) > MOST_FOLDED * most:
         raise TooLargeError
     graph, leaves = ScalarGraph(most, values_only), jax.tree.leaves(arguments)
@@ -200,9 +204,9 @@ def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[n
 def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Sequence[np.ndarray]:
     name, parameters = equation.primitive.name, equation.params
     avals: list[Any] = [each.aval for each in equation.invars]
-    aval: Any = equation.outvars[0].aval
     if not any(math.prod(each.aval.shape) for each in equation.outvars):
         return [filled(each.aval.shape, ()) for each in equation.outvars]
+    aval: Any = equation.outvars[0].aval
     if name in _SAME or (graph.values_only and name == "stop_gradient"):
         return inputs
     if name in ELEMENTWISE:
@@ -219,7 +223,8 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
         return outputs
     if name == "while":
         return _loop(graph, equation, inputs)
-    if not any(isinstance(each, Node) for each in entries_of(inputs)):
+    keys = any(jnp.issubdtype(each.aval.dtype, jax.dtypes.extended) for each in equation.outvars)
+    if not keys and not any(isinstance(each, Node) for each in entries_of(inputs)):
         with jax.ensure_compile_time_eval():
             arrays = [array_of(each.flat, of) for each, of in zip(inputs, avals, strict=True)]
             return [constants(each) for each in bind_whole(equation, arrays)]
@@ -258,10 +263,10 @@ def _scan(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> li
     stacked = [np.empty(aval.shape, object) for aval in avals]
     passes = range(parameters["length"])
     for at in reversed(passes) if parameters["reverse"] else passes:
-        outputs = run(graph, parameters["jaxpr"], [*consts, *carry, *(each[at] for each in rows)])
+        outputs = run(graph, parameters["jaxpr"], [*consts, *carry, *(each[at, ...] for each in rows)])
         carry = outputs[: len(carry)]
         for every, one in zip(stacked, outputs[len(carry) :], strict=True):
-            every[at] = one
+            every[at, ...] = one
     return [*carry, *stacked]
 
 

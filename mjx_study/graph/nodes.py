@@ -55,6 +55,10 @@ class TooLargeError(Exception):
     """The graph has too many scalars to be worth compiling."""
 
 
+class SideEffectsError(Exception):
+    """The function does more than compute its result."""
+
+
 @contextmanager
 def collection_paused() -> Generator[None]:
     """Without Python's garbage collection, which takes a third of the time that large graphs do, and finds nothing."""

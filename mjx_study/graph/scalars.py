@@ -18,7 +18,7 @@ from jax.core import Tracer
 
 from mjx_study.graph.function import MOST_KEPT, ScalarFunction, capture, is_input
 from mjx_study.graph.native import count_left, in_numpy, native_identity
-from mjx_study.graph.nodes import TooLargeError
+from mjx_study.graph.nodes import SideEffectsError, TooLargeError
 from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
@@ -58,8 +58,8 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
             if captured and any(node.operation == "whole" for node in captured.needed):
                 values = capture(function, *arguments, most=2 * most, values_only=True)
                 captured = dataclasses.replace(captured, values=values)
-        except TooLargeError:
-            captured = _left()
+        except (TooLargeError, SideEffectsError) as error:
+            captured = _left("side effects" if isinstance(error, SideEffectsError) else None)
         _CAPTURED[key] = captured
     return _CAPTURED[key]
 
@@ -72,9 +72,9 @@ def is_small(function: ScalarFunction) -> bool:
     return False
 
 
-def _left() -> None:
+def _left(reason: str | None = None) -> None:
     if native_identity() is not None:
-        count_left(f"more than {most_scalars()} operations")
+        count_left(reason or f"more than {most_scalars()} operations")
 
 
 def most_scalars() -> int:

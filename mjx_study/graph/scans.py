@@ -125,8 +125,8 @@ def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
     ]
     if not wanted or not parameters["length"]:
         return None
-    if any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals):
-        count_left("loop over random keys")
+    if equation.effects or any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals):
+        count_left("loop with side effects" if equation.effects else "loop over random keys")
         return None
     try:
         function, used = _body(body, inputs, fixed, wanted, range(num_consts, num_consts + carried))
