@@ -289,7 +289,7 @@ def test_a_failing_compiler_is_reported_and_done_without(folder, monkeypatch, ca
     name = build.build_library("this is not C")
     assert not build.library_ready(name)
     told = capsys.readouterr().err
-    assert "failed, steps run through XLA: see the end of" in told
+    assert "failed: see the end of" in told and "XLA" not in told
     kept = told.strip().rpartition(" ")[2]
     assert "this is not C\n// " in Path(kept).read_text()
     monkeypatch.setattr(native, "library_ready", lambda name: False)
@@ -297,12 +297,22 @@ def test_a_failing_compiler_is_reported_and_done_without(folder, monkeypatch, ca
     np.testing.assert_allclose(found, ROW**3 + 7)
 
 
+def test_each_function_that_is_left_is_counted_once(monkeypatch):
+    monkeypatch.setattr(native, "_LEFT", native.Counter())
+    with native.postponed():
+        lowered = jax.jit(jax.vmap(lambda x: unrolled(lambda y: jnp.fft.fft(y).real, x))).lower(np.ones((2, 3)))
+    assert "native" not in lowered.as_text() and native._LEFT == {"values of type complex128": 1}
+
+
 ALONE = """
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
+from mjx_study.graph.native import native_summary
 from mjx_study.graph.scalars import unrolled
 print(jax.make_jaxpr(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
-print(jax.jit(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
+found = jax.jit(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3))
+print(native_summary())
+print(found)
 """
 
 
@@ -313,8 +323,22 @@ print(jax.jit(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
 def test_without_a_compiler(setting, lines, in_xla):
     environment = {key: value for key, value in os.environ.items() if key not in ("CC", SWITCH)} | setting
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment)
-    assert done.stdout.splitlines()[-1] == "[2. 2. 2.]" and ("native" not in done.stdout) == in_xla
+    assert done.stdout.splitlines()[-2:] == [f"{0 if in_xla else 1} libraries", "[2. 2. 2.]"]
+    assert ("native" not in done.stdout) == in_xla
     assert done.stderr.count("mjx-study: no C compiler found: steps run more slowly, on CPUs in NumPy") == lines
+
+
+def test_with_a_compiler_that_fails(tmp_path):
+    compiler = tmp_path / "cc"
+    compiler.write_text('#!/bin/sh\n[ "$1" = --version ]\n')
+    compiler.chmod(0o700)
+    environment = {key: value for key, value in os.environ.items() if key != SWITCH}
+    environment |= {name: str(tmp_path) for name in ("XDG_CACHE_HOME", "TMPDIR")} | {"CC": str(compiler)}
+    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment)
+    assert "native" in done.stdout and done.stdout.endswith("\n1 libraries\n[2. 2. 2.]\n")
+    failure, instead = done.stderr.splitlines()
+    assert f"{compiler} failed: see the end of" in failure and "XLA" not in failure
+    assert instead == "mjx-study: steps run more slowly, on CPUs in NumPy"
 
 
 def test_the_compiler_from_pypi(tmp_path):
@@ -330,7 +354,7 @@ def test_the_compiler_from_pypi(tmp_path):
         "XDG_CACHE_HOME": str(tmp_path / "cache"),
     }
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment)
-    assert "native" in done.stdout and not done.stderr
+    assert "native" in done.stdout and "\n1 libraries\n" in done.stdout and not done.stderr
 
 
 UNTOUCHED = 0x7FF123456789ABCD

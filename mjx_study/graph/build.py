@@ -187,7 +187,7 @@ def _failed(written: Path, compiler: str, errors: str) -> None:
         return
     kept = Path(tempfile.mkdtemp(prefix="mjx-study-failed-"), written.name)
     kept.write_text(written.read_text() + "".join(f"\n// {line}" for line in errors.splitlines()))
-    print(f"mjx-study: {compiler} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)
+    print(f"mjx-study: {compiler} failed: see the end of {kept}", file=sys.stderr)
 
 
 def _run(*command: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -220,6 +220,6 @@ def _loaded(name: str, content: bytes) -> Any:
                 raise OSError(f"error {error} of the CUDA driver")
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="CUDA" if on_gpu else "cpu")
         except (OSError, AttributeError, jax.errors.JaxRuntimeError) as error:
-            print(f"mjx-study: native code cannot be loaded, steps run through XLA: {error}", file=sys.stderr)
+            print(f"mjx-study: native code cannot be loaded: {error}", file=sys.stderr)
             return None
     return library

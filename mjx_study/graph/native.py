@@ -1,6 +1,7 @@
 """Functions of small arrays as native code, called by XLA for a whole batch at once."""
 
 import os
+import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -66,6 +67,7 @@ def written(function: ScalarFunction, passes: Passes | None = None) -> str:
 def native_summary() -> str:
     """Libraries that this process has loaded, and how many functions are left to XLA and why."""
     loaded = sum(map(library_ready, known_libraries())) if native_identity() else 0
+    loaded -= computes_steps() == "native"  # that of `_compiles`
     return f"{loaded} libraries" + "".join(f", {count} through XLA: {why}" for why, count in _LEFT.items())
 
 
@@ -76,11 +78,14 @@ def count_left(reason: str) -> None:
 
 @cache
 def _compiles() -> bool:
-    """Whether there is a compiler, and builds the smallest of functions."""
+    """Whether there is a compiler, and builds the smallest of functions; if it does not, a line says so."""
     if compiler() is None:
         return False
     function = capture(lambda x: x + 1, jax.ShapeDtypeStruct((), np.float32), most=9)
-    return library_ready(build_library(source_of(function, jax.default_backend())))
+    built = library_ready(build_library(source_of(function, jax.default_backend())))
+    if not built:
+        print("mjx-study: steps run more slowly, on CPUs in NumPy", file=sys.stderr)
+    return built
 
 
 class NativeFunction:
@@ -109,21 +114,17 @@ class NativeFunction:
         self.platform = jax.default_backend()
 
     @cached_property
-    def name(self) -> str:
-        """Name of the library, which is being built; it may raise NotWrittenError."""
-        return build_library(self._write())
+    def name(self) -> str | None:
+        """Name of the library, which is being built; None, which is counted, if it cannot be written."""
+        try:
+            return build_library(self._write())
+        except NotWrittenError as error:
+            count_left(str(error))
+            return None
 
     def begun(self) -> bool:
         """Begin to build the library; whether it can be written."""
-        try:
-            return bool(self.name)
-        except NotWrittenError as error:
-            count_left(str(error))
-            return False
-
-    def ready(self) -> bool:
-        """Wait for the library to be built and loaded; whether that succeeded."""
-        return self.begun() and library_ready(self.name)
+        return self.name is not None
 
     def __call__(self, *inputs: jax.Array) -> list[jax.Array]:
         return _native.bind(*inputs, function=self, batch=())
@@ -188,12 +189,14 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 
 
 def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
-    if function.platform != platform or not function.ready():
-        count_left("not built")
+    name = function.name if function.platform == platform else ""
+    if not name or not library_ready(name):
+        if name is not None:
+            count_left("not built")
         return _lower_plain(context, *operands, function=function, batch=batch)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]
-    lowering = jax.ffi.ffi_lowering(function.name, operand_layouts=ins, result_layouts=outs)
+    lowering = jax.ffi.ffi_lowering(name, operand_layouts=ins, result_layouts=outs)
     results: Any = lowering(context, *operands)
     attributes = results[0].owner.attributes  # JAX says that the call is typed beside the operation, where XLA loses it
     del attributes["mhlo.backend_config"]
