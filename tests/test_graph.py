@@ -139,6 +139,8 @@ FUNCTIONS = {
     "loop of no step": lambda x: jax.lax.fori_loop(0, 0, lambda _, y: y * 2, x),
     "empty": lambda x: (x[:0], jnp.sum(x[:0]), jnp.zeros((0, 3)) @ x, jnp.zeros((2, 0)) @ x[:0]),
     "constants": lambda x: (jnp.ones(2), 3, jnp.sum(TABLE)),
+    "constants as integers": lambda x: [jnp.array([1e10, -1e10, jnp.nan, 2.7]).astype(to) for to in ("int32", "uint8")],
+    "first nan": lambda x: [find(x * jnp.array([[1, jnp.nan, 1], [1, 1, 1]]), 1) for find in (jnp.argmax, jnp.argmin)],
 }  # fmt: skip
 
 
@@ -158,7 +160,19 @@ def _looked_up(x):
     )
 
 
-FUNCTIONS["computed indices of large arrays"] = _looked_up
+def _of_few_bits(x):
+    """Large arrays at indices of types that cannot count their entries."""
+    tall, long = jnp.asarray(np.tile(FIELD, (5, 1))), jnp.sin(jnp.arange(300.0))
+    i, j = (jnp.floor(30 * jnp.abs(x[0])).astype(kind) for kind in (jnp.int8, jnp.uint8))
+    return (
+        tall[i, 2],
+        jnp.take(tall, j, axis=0, mode="clip"),
+        long[i] + long[j],
+        jax.lax.dynamic_slice(long, (i,), (2,)),
+    )
+
+
+FUNCTIONS |= {"computed indices of large arrays": _looked_up, "indices of few bits": _of_few_bits}
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

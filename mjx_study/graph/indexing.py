@@ -39,6 +39,8 @@ class _Windows:
     def __init__(
         self, graph: ScalarGraph, shape: Sequence[int], sizes: Sequence[int], numbers: Any, indices: Any, clip: bool
     ):
+        if indices.size and indices.flat[0].dtype.itemsize < 4:  # places are computed in the indices' type
+            indices = filled(indices.shape, [graph.converted(each, np.dtype(np.int32)) for each in indices.flat])
         self._graph, self._sizes, self._numbers, self._indices, self._clip = graph, sizes, numbers, indices, clip
         self._flat = np.arange(math.prod(shape)).reshape(shape)
         self._last = [whole - size for whole, size in zip(shape, sizes, strict=True)]

@@ -334,7 +334,7 @@ def _folded(primitive: Any, arguments: tuple[Any, ...], dtype: Any, parameters: 
     match primitive.name:
         case "select_n":
             return arguments[1 + int(arguments[0])]
-        case "convert_element_type":
+        case "convert_element_type" if arguments[0].dtype.kind != "f" or dtype.kind not in "iu":
             return arguments[0].astype(dtype)
         case name if name in _NUMPY:
             with np.errstate(all="ignore"):

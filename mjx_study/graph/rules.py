@@ -56,13 +56,18 @@ def _reduction(combine: Any) -> Rule:
     return rule
 
 
-def _place_of_extreme(better: Any) -> Rule:
+def _place_of_extreme(no_better: Any) -> Rule:
+    """Place of the first NaN, or else of the first entry to which all others are no better."""
+
     def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
         rows = np.moveaxis(inputs[0], parameters["axes"][0], -1)
-        kind = rows.flat[0].dtype
+        kind, truth = rows.flat[0].dtype, aval.update(dtype=np.dtype(bool))
         best, place = rows[..., 0], constants(np.zeros(aval.shape, aval.dtype))
         for at in range(1, rows.shape[-1]):
-            here = graph.elementwise(better, [rows[..., at], best], aval.update(dtype=np.dtype(bool)))
+            worse = graph.elementwise(no_better, [rows[..., at], best], truth)
+            here = graph.elementwise(lax.not_p, [worse], truth)
+            if kind.kind == "f":
+                here = graph.elementwise(lax.and_p, [here, graph.elementwise(lax.eq_p, [best, best], truth)], truth)
             best = graph.elementwise(lax.select_n_p, [here, best, rows[..., at]], aval.update(dtype=kind))
             this = constants(np.full(aval.shape, at, aval.dtype))
             place = graph.elementwise(lax.select_n_p, [here, place, this], aval)
@@ -203,8 +208,8 @@ def _precedes(graph: ScalarGraph, one: Sequence[Any], other: Sequence[Any]) -> A
 RULES: Final[dict[str, Rule]] = {
     **INDEXING,
     **dict.fromkeys(("squeeze", "reshape", "expand_dims"), lambda _, inputs, aval, __: [inputs[0].reshape(aval.shape)]),
-    "argmax": _place_of_extreme(lax.gt_p),
-    "argmin": _place_of_extreme(lax.lt_p),
+    "argmax": _place_of_extreme(lax.le_p),
+    "argmin": _place_of_extreme(lax.ge_p),
     "bitcast_convert_type": _reinterpreted,
     "broadcast_in_dim": _broadcast,
     "cholesky": _cholesky,
