@@ -79,26 +79,6 @@ class Compiled:
         with awaited():
             return self.executable(*arguments)(*arguments)
 
-    @property
-    def num_compilations(self) -> int:
-        """Number of argument forms compiled in this process."""
-        programs = {self._whole, *self._ready.values()}
-        return sum(1 if isinstance(each, jax.stages.Compiled) else each._cache_size() for each in programs)
-
-    def prepare(self, *arguments: Any, platform: str | None = None) -> Callable[..., Any]:
-        """Trace the function in this thread, or load its cached trace.
-
-        Args:
-            arguments: arrays, or their shapes and types (`jax.ShapeDtypeStruct`).
-            platform: platform of the devices; traces are cached for JAX's default one only.
-
-        Returns:
-            A function of arguments of this form, which threads may call in parallel.
-        """
-        if platform not in (None, jax.default_backend()):
-            return self._uncached(arguments)
-        return self._prepared(*self._form(arguments), arguments)
-
     def within(self, *arguments: Any) -> Callable[..., Any]:
         """The function for use within another program that JAX's default backend runs: its cached trace, which cannot
         be batched or differentiated, or else `jitted`."""
@@ -109,7 +89,7 @@ class Compiled:
         return jax.jit(loaded.__wrapped__)  # XLA's options are those of the other program
 
     def outputs(self, *arguments: Any, platform: str | None = None) -> Any:
-        """Shapes and types of the outputs, from the function's trace; see `prepare` for the arguments."""
+        """Shapes and types of the outputs, from the function's trace; see `executable` for the arguments."""
         if platform not in (None, jax.default_backend()):
             return jax.eval_shape(self._uncached(arguments), *arguments)
         key, types, form = self._form(arguments)
@@ -132,11 +112,18 @@ class Compiled:
         """
         return self._begin(*self._form(types), types, options)
 
-    def executable(self, *arguments: Any) -> Callable[..., Any]:
-        """The function for arguments of this form, compiled where JAX's default device is the only one, as on CPUs.
+    def executable(self, *arguments: Any, platform: str | None = None) -> Callable[..., Any]:
+        """The function for arguments of this form, which threads may call in parallel, traced in this thread or loaded.
 
-        Like `ahead`, whatever devices the arguments are on: JAX's cache holds one program for both.
+        Compiled where JAX's default device is the only one, as on CPUs, like `ahead`, whatever devices the arguments
+        are on: JAX's cache holds one program for both.
+
+        Args:
+            arguments: arrays, or their shapes and types (`jax.ShapeDtypeStruct`).
+            platform: platform of the devices; traces are cached for JAX's default one only.
         """
+        if platform not in (None, jax.default_backend()):
+            return self._uncached(arguments)
         key, types, form = self._form(arguments)
         if jax.default_backend() == "cpu":
             self._begin(key, types, form, arguments)()

@@ -56,9 +56,7 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
 
     # Traced in this thread, since tracing patches MJX for the whole process.
     first = *placed[devices[0]], *(array[chunks[0]] for array in rows)
-    platform = devices[0].platform
-    alone = platform == jax.default_backend() == "cpu"
-    run = program.executable(*first) if alone else program.prepare(*first, platform=platform)
+    run = program.executable(*first, platform=devices[0].platform)
     left = iter(range(len(chunks)))
 
     def work(device: Any) -> None:

@@ -85,7 +85,7 @@ def _of_caches(root: Path, draw: random.Random) -> Iterator[tuple[Path, Callable
     (root / "traces").mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(compiled, "traces_folder", lambda: root / "traces")
-        compiled.Compiled(jnp.sin, "sine").prepare(1.0)
+        compiled.Compiled(jnp.sin, "sine").executable(1.0)
     (trace,) = (root / "traces").iterdir()
 
     def check(path: Path, read: Callable[[Path], Any]) -> int:
