@@ -70,6 +70,20 @@ def settings() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def compilations() -> Iterator[list[str]]:
+    """Names of the programs that XLA compiles during a test."""
+    names: list[str] = []
+
+    def compiled(event: str, *_: Any, fun_name: str = "", **__: Any) -> None:
+        if event.endswith("backend_compile_duration"):
+            names.append(fun_name)
+
+    jax.monitoring.register_event_duration_secs_listener(compiled)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(compiled)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def memory(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator[None]:
     """What is compiled is dropped between modules once this process has grown: all modules together need 20 GB.

@@ -33,18 +33,17 @@ def simulator() -> Simulator:
 # Compilation, chunks, devices
 
 
-def test_a_sweep_compiles_each_program_once(simulator):
+def test_a_sweep_compiles_each_program_once(simulator, compilations):
     """13 stiffnesses, 2 families, and other theta and sigma."""
-    task, compiled = pusher_task(), []
+    task = pusher_task()
     for family in ("penalty", "impedance"):
         for stiffness in np.geomspace(1.0, 4000.0, 13):
             contact = family_model(family, task.scene, stiffness=float(stiffness), effective_mass=task.effective_mass)
             objective = simulator.objective(contact, sigma=float(0.01 * stiffness))
             values = objective.evaluate(task.theta * stiffness, sample_keys(2)).value
             gradients = objective.differentiate(task.theta * stiffness, sample_keys(2)).gradient
-            compiled.append(sum(program.num_compilations for program in simulator._programs.values()))
             assert np.all(np.isfinite(values)) and np.all(np.isfinite(gradients))
-    assert set(compiled) == {2}
+    assert all(compilations.count(name) <= 1 for name in ("jit(value)", "jit(gradient)"))  # 0 if other tests had it
 
 
 @pytest.fixture(scope="module")
