@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import batching, mlir
 
 from mjx_study.graph import cuda
 from mjx_study.graph.build import build_identity, build_library, compiler, known_libraries, library_ready
@@ -154,13 +154,6 @@ def _plain(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) -> li
     return each(*inputs)
 
 
-def _differentiate(primals: Any, tangents: Any, *, function: NativeFunction, batch: tuple[int, ...]) -> Any:
-    outputs = _native.bind(*primals, function=function, batch=batch)
-    plain = partial(_plain, function=function, batch=batch)
-    changes = jax.jvp(plain, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))[1]
-    return outputs, [ad.Zero(each.aval) if each.dtype == jax.float0 else each for each in changes]
-
-
 def _batch(
     arguments: Sequence[Any], axes: Sequence[Any], *, function: NativeFunction, batch: tuple[int, ...]
 ) -> tuple[list[Any], list[int]]:
@@ -214,7 +207,6 @@ _native = Primitive("native")
 _native.multiple_results = True
 _native.def_impl(_evaluate)
 _native.def_abstract_eval(_types)
-ad.primitive_jvps[_native] = _differentiate
 batching.primitive_batchers[_native] = _batch
 mlir.register_lowering(_native, partial(_lower, "cpu"), platform="cpu")
 mlir.register_lowering(_native, partial(_lower, "gpu"), platform="cuda")

@@ -52,7 +52,8 @@ def computed(
             slope = derivative(function, moving)
         except NotDifferentiableError as error:  # JAX differentiates the operations on whole arrays
             count_left(f"derivative of {error}")
-            return jax.jvp(program, tuple(primals), tuple(instantiated(list(primals), list(changes))))
+            whole = tuple(instantiated(list(primals), list(changes)))
+            return value, jax.jvp(written_out(function), tuple(primals), whole)[1]
         found = iter(applied(slope, primals, [changes[place] for place in moving]))
         return value, [next(found) if aval.dtype.kind == "f" else None for aval in function.avals]
 
