@@ -120,6 +120,7 @@ FUNCTIONS = {
     "largest entries of any kind": lambda x: jax.lax.top_k(jnp.log(x).at[0].set(jnp.inf), x.size),
     "chosen by largest": lambda x: jnp.outer(x, x)[jax.lax.top_k(-x, 2)[1]] * x,
     "whole arrays": lambda x: (jnp.sort(x), jnp.linalg.cholesky(jnp.outer(x, x) + 9 * jnp.eye(3))),
+    "sorted by two keys": lambda x: x[jnp.lexsort((-x, jnp.round(x)))],
     "loops": _newton_root,
     "loop of members": lambda x: jax.vmap(partial(_until, 9.0))(_members(x)),
     "loop of members with limits of their own": lambda x: jax.vmap(_until)(3 * jnp.arange(1, 4) + x, _members(x)[:3]),

@@ -5,9 +5,10 @@ Each rule is a function (graph, inputs, aval of the output, parameters) -> outpu
 is.
 """
 
+import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -111,37 +112,31 @@ def _reinterpreted(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Pa
     return [graph.elementwise(lax.bitcast_convert_type_p, inputs, aval, **parameters)] if same else None
 
 
-class _Arithmetic:
+def _arithmetic(graph: ScalarGraph, dtype: Any) -> Callable[..., Any]:
     """Operations on scalars of one type."""
+    return lambda primitive, *arguments: graph.scalar(primitive, arguments, dtype)
 
-    def __init__(self, graph: ScalarGraph, dtype: Any):
-        self._graph, self._dtype = graph, dtype
 
-    def less(self, value: Any, pairs: Sequence[tuple[Any, Any]]) -> Any:
-        """Subtract the products of pairs."""
-        for pair in pairs:
-            value = self.of(lax.sub_p, value, self.of(lax.mul_p, *pair))
-        return value
-
-    def of(self, primitive: Any, *arguments: Any) -> Any:
-        return self._graph.scalar(primitive, arguments, self._dtype)
+def _less(of: Callable[..., Any], value: Any, pairs: Iterable[tuple[Any, Any]]) -> Any:
+    """Subtract the products of pairs."""
+    return functools.reduce(lambda left, pair: of(lax.sub_p, left, of(lax.mul_p, *pair)), pairs, value)
 
 
 def _cholesky(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     """Lower factor; NaN where the matrix is not positive definite."""
-    scalars = _Arithmetic(graph, aval.dtype)
+    of = _arithmetic(graph, aval.dtype)
     factors = constants(np.zeros(aval.shape, aval.dtype))
     for at in np.ndindex(*aval.shape[:-2]):
         matrix, lower = inputs[0][at], factors[at]
         for j, i in itertools.combinations_with_replacement(range(len(matrix)), 2):
-            rest = scalars.less(matrix[i, j], list(zip(lower[i, :j], lower[j, :j], strict=True)))
-            lower[i, j] = scalars.of(lax.sqrt_p, rest) if i == j else scalars.of(lax.div_p, rest, lower[j, j])
+            rest = _less(of, matrix[i, j], zip(lower[i, :j], lower[j, :j], strict=True))
+            lower[i, j] = of(lax.sqrt_p, rest) if i == j else of(lax.div_p, rest, lower[j, j])
     return [factors]
 
 
 def _triangular_solve(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     """Solve op(A) X = B, or X op(A) = B as op(A)^T X^T = B^T, by substitution."""
-    scalars, left, unit = _Arithmetic(graph, aval.dtype), parameters["left_side"], parameters["unit_diagonal"]
+    of, left, unit = _arithmetic(graph, aval.dtype), parameters["left_side"], parameters["unit_diagonal"]
     matrices, right = inputs
     turned = parameters["transpose_a"] == left
     matrices = matrices.swapaxes(-1, -2) if turned else matrices
@@ -153,19 +148,21 @@ def _triangular_solve(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters:
         for i in rows if downwards else reversed(rows):
             known = rows[:i] if downwards else rows[i + 1 :]
             for column in range(solution.shape[1]):
-                rest = scalars.less(solution[i, column], [(matrix[i, k], solution[k, column]) for k in known])
-                solution[i, column] = rest if unit else scalars.of(lax.div_p, rest, matrix[i, i])
+                rest = _less(of, solution[i, column], [(matrix[i, k], solution[k, column]) for k in known])
+                solution[i, column] = rest if unit else of(lax.div_p, rest, matrix[i, i])
     return [solutions if left else solutions.swapaxes(-1, -2)]
 
 
-def _sort(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
+def _sort(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     """Exchange neighbours that are out of order until none is; stable, with NaN last."""
-    axis, keys = parameters["dimension"], parameters["num_keys"]
+    if parameters["num_keys"] > 1:
+        return None
+    axis = parameters["dimension"]
     arrays = [np.moveaxis(each, axis, 0).copy() for each in inputs]
     size = len(arrays[0])
     for row in np.ndindex(*arrays[0].shape[1:]):
         for at in (at for end in range(size - 1, 0, -1) for at in range(end)):
-            _exchange(graph, arrays, (at + 1, *row), (at, *row), keys)
+            _exchange(graph, arrays, (at + 1, *row), (at, *row))
     return [np.moveaxis(each, 0, axis) for each in arrays]
 
 
@@ -180,9 +177,9 @@ def _top_k(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters
     return [np.moveaxis(each[:k], 0, axis) for each in (entries, indices)]
 
 
-def _exchange(graph, arrays, after, here, keys: int = 1, reverse: bool = False) -> None:
-    """Exchange two entries of arrays if the keys, the first arrays, of the second come before those of the first."""
-    ordered = [[each[at] for each in arrays[:keys]] for at in (after, here)]
+def _exchange(graph: ScalarGraph, arrays: Arrays, after: Any, here: Any, reverse: bool = False) -> None:
+    """Exchange two entries of arrays if those of the first array, the keys, are out of order."""
+    ordered = [arrays[0][at] for at in (after, here)]
     swap = _precedes(graph, *(reversed(ordered) if reverse else ordered))
     for each in arrays:
         low, high = each[here], each[after]
@@ -190,19 +187,13 @@ def _exchange(graph, arrays, after, here, keys: int = 1, reverse: bool = False) 
         each[after] = graph.scalar(lax.select_n_p, (swap, high, low), low.dtype)
 
 
-def _precedes(graph: ScalarGraph, one: Sequence[Any], other: Sequence[Any]) -> Any:
-    """Whether a vector of keys comes before another in lexicographic order."""
-    logic = _Arithmetic(graph, np.dtype(bool))
-    (a, *rest_a), (b, *rest_b) = one, other
-    before = logic.of(lax.lt_p, a, b)
-    if a.dtype.kind == "f":
-        numbers = logic.of(lax.and_p, logic.of(lax.eq_p, a, a), logic.of(lax.ne_p, b, b))
-        before = logic.of(lax.or_p, before, numbers)
-    if not rest_a:
-        return before
-    after = _precedes(graph, other[:1], one[:1])
-    later = logic.of(lax.and_p, logic.of(lax.not_p, after), _precedes(graph, rest_a, rest_b))
-    return logic.of(lax.or_p, before, later)
+def _precedes(graph: ScalarGraph, one: Any, other: Any) -> Any:
+    """Whether a number comes before another; NaN is last."""
+    of = _arithmetic(graph, np.dtype(bool))
+    before = of(lax.lt_p, one, other)
+    if one.dtype.kind == "f":
+        before = of(lax.or_p, before, of(lax.and_p, of(lax.eq_p, one, one), of(lax.ne_p, other, other)))
+    return before
 
 
 RULES: Final[dict[str, Rule]] = {
