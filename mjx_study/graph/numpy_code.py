@@ -5,15 +5,12 @@ calls a library, and its name is a digest of its content, too: caches need not k
 """
 
 import ctypes
-import functools
 import math
 import re
 import traceback
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any, Final
 
-import jax.ffi
 import numpy as np
 from scipy import special
 
@@ -217,8 +214,8 @@ class Library:
     def _called(self, at: int) -> int | None:
         frame = _Frame.from_address(at)
         if frame.extension and _Extension.from_address(frame.extension).kind == 1:
-            version = _Metadata.from_address(_Extension.from_address(frame.extension).metadata).version
-            version.major, version.minor = _version()
+            metadata = _Metadata.from_address(_Extension.from_address(frame.extension).metadata)
+            metadata.version = _Api.from_address(frame.api).version
             return None
         try:
             self._compute(frame)
@@ -257,14 +254,6 @@ def _array(buffer: Any, size: int, kind: str, rank: int) -> np.ndarray:
     count = math.prod(buffer.dims[axis] for axis in range(buffer.rank - rank))
     memory = (ctypes.c_char * (size * count * dtype.itemsize)).from_address(buffer.data)
     return np.frombuffer(memoryview(memory), dtype).reshape(size, count)
-
-
-@functools.cache
-def _version() -> tuple[int, int]:
-    """Version of XLA's interface."""
-    header = Path(jax.ffi.include_dir(), "xla", "ffi", "api", "c_api.h").read_text()
-    major, minor = (int(re.findall(rf"#define XLA_FFI_API_{part} (\d+)", header)[0]) for part in ("MAJOR", "MINOR"))
-    return major, minor
 
 
 def _struct(**fields: Any) -> Any:
