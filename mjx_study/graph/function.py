@@ -185,19 +185,28 @@ def inlined(graph: ScalarGraph, function: Callable[..., Any], *arrays: np.ndarra
 
 def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Evaluate a jaxpr, closed or without constants; array entries are nodes or NumPy scalars."""
-    jaxpr, consts = getattr(closed, "jaxpr", closed), [constants(each) for each in getattr(closed, "consts", ())]
+
+    def boxed(equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        outputs = _equation(graph, equation, inputs)
+        return [each if isinstance(each, np.ndarray) else filled((), [each]) for each in outputs]  # NumPy unboxes
+
+    return interpreted(boxed, closed, inputs, constants)
+
+
+def interpreted(
+    outputs_of: Callable[..., Any], closed: Any, inputs: Sequence[Any], constant: Callable[[Any], Any] = lambda it: it
+) -> list[Any]:
+    """Outputs of a program, from those of its operations."""
+    jaxpr = getattr(closed, "jaxpr", closed)
+    consts = map(constant, getattr(closed, "consts", ()))
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
 
-    def read(atom: Any) -> np.ndarray:
-        if isinstance(atom, Literal):
-            kind: Any = atom.aval
-            return constants(np.asarray(atom.val, kind.dtype))
-        return values[atom]
+    def read(atom: Any) -> Any:
+        return constant(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else values[atom]
 
     for equation in jaxpr.eqns:
-        outputs = _equation(graph, equation, [read(atom) for atom in equation.invars])
-        boxed = [each if isinstance(each, np.ndarray) else filled((), [each]) for each in outputs]  # NumPy unboxes
-        values |= zip(equation.outvars, boxed, strict=True)
+        outputs = outputs_of(equation, [read(atom) for atom in equation.invars])
+        values |= zip(equation.outvars, outputs, strict=True)
     return [read(atom) for atom in jaxpr.outvars]
 
 

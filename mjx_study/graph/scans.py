@@ -17,7 +17,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from mjx_study.graph.c import NotWrittenError
-from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, programs_in, run, scan_inputs
+from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, interpreted, programs_in, run, scan_inputs
 from mjx_study.graph.native import NativeFunction, count_left, native_identity, postponed, written
 from mjx_study.graph.nodes import ScalarGraph, TooLargeError, constants
 from mjx_study.graph.scalars import most_scalars
@@ -45,7 +45,7 @@ def with_native_scans(function: Callable[..., Any]) -> Callable[..., Any]:
         closed = _without_rules(closed)
         jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(leaves), instantiate=True)
         natively = partial(_natively, set())
-        return structure.unflatten(_evaluated(natively, ClosedJaxpr(jaxpr, closed.consts), *jax.tree.leaves(arguments)))
+        return structure.unflatten(interpreted(natively, ClosedJaxpr(jaxpr, closed.consts), jax.tree.leaves(arguments)))
 
     return program
 
@@ -55,7 +55,7 @@ def _without_rules(closed: ClosedJaxpr) -> ClosedJaxpr:
 
     Nothing is then computed because a derivative might depend on it, and loops that copy their rows need not run.
     """
-    return jax.make_jaxpr(partial(_evaluated, _inlined, closed))(*closed.in_avals)
+    return jax.make_jaxpr(lambda *inputs: interpreted(_inlined, closed, inputs))(*closed.in_avals)
 
 
 def _inlined(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
@@ -64,7 +64,7 @@ def _inlined(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
     if not isinstance(inner, ClosedJaxpr) or not (name == "ruled" or _has(inner.jaxpr, "ruled")):
         return bind_whole(equation, inputs)
     if name in ("ruled", "jit", "pjit"):
-        return _evaluated(_inlined, inner, *inputs)
+        return interpreted(_inlined, inner, inputs)
     if name != "scan":
         return bind_whole(equation, inputs)
     body = _without_rules(inner)
@@ -92,25 +92,9 @@ def _natively(left: set[int], equation: Any, inputs: Sequence[Any]) -> Sequence[
             return loop
         left.add(length)
     if name in ("jit", "pjit") and isinstance(inner, ClosedJaxpr) and _has(inner.jaxpr, "scan"):
-        return _evaluated(partial(_natively, left), inner, *inputs)
+        return interpreted(partial(_natively, left), inner, inputs)
     _build(equation)
     return bind_whole(equation, inputs)
-
-
-def _evaluated(
-    outputs_of: Callable[[Any, Sequence[Any]], Sequence[Any]], closed: ClosedJaxpr, *inputs: Any
-) -> list[Any]:
-    """Outputs of a program, from those of its operations."""
-    jaxpr = closed.jaxpr
-    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed.consts, *inputs), strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if isinstance(atom, Literal) else values[atom]
-
-    for equation in jaxpr.eqns:
-        outputs = outputs_of(equation, [read(atom) for atom in equation.invars])
-        values |= zip(equation.outvars, outputs, strict=True)
-    return [read(atom) for atom in jaxpr.outvars]
 
 
 def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
