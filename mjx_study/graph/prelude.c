@@ -61,21 +61,12 @@ ONE int any(mask m) {
 
 ONE mask select_bool(mask m, mask no, mask yes) { return (m & yes) | (~m & no); }
 
-#define SELECT(type, bits)                                 \
-  ONE type select_##type(mask m, type no, type yes) {      \
-    bits chosen = AS(bits, m);                             \
+#define SELECT(type)                                            \
+  ONE type select_##type(mask m, type no, type yes) {           \
+    typedef __typeof__(no < no) bits;                           \
+    bits chosen = AS(bits, m);                                  \
     return (type)((chosen & (bits)yes) | (~chosen & (bits)no)); \
   }
-SELECT(f64, i64)
-SELECT(f32, i32)
-SELECT(i64, i64)
-SELECT(i32, i32)
-SELECT(i16, i16)
-SELECT(i8, i8)
-SELECT(u64, i64)
-SELECT(u32, i32)
-SELECT(u16, i16)
-SELECT(u8, i8)
 
 // Inputs and outputs: entry `at` of an array, for all lanes. Booleans are bytes in memory.
 
@@ -88,7 +79,8 @@ SELECT(u8, i8)
                 sizeof(r[0]));                                                                                       \
     r;                                                                                                               \
   })
-#define CONSTANTS(type) static const __typeof__(((type){0})[0])
+#define LANE(type) __typeof__(((type){0})[0])
+#define CONSTANTS(type) static const LANE(type)
 #define TABLE(type, table, at)                      \
   ({                                                \
     type r;                                         \
@@ -103,16 +95,10 @@ SELECT(u8, i8)
 #define RECALL(type, slot) (*(const type##_anywhere *)(kept + (slot) * VECTOR))
 #define KEEP(type, slot, value) (*(type##_anywhere *)(kept + (slot) * VECTOR) = (value))
 
-// Operations of floats, as JAX defines them: extremes propagate NaN, signs keep zeros.
+// Operations of each lane.
 
 #define FLOATS(type, bits, suffix)                                                                \
   ONE type abs_##type(type x) { return (type)((bits)x & ~(bits)ALL(type, -0.0##suffix)); }        \
-  ONE type max_##type(type a, type b) { return select_##type(MASK((a > b) | (a != a)), b, a); }   \
-  ONE type min_##type(type a, type b) { return select_##type(MASK((a < b) | (a != a)), b, a); }   \
-  ONE type sign_##type(type x) {                                                                  \
-    type one = (type)(((bits)x & (bits)ALL(type, -0.0##suffix)) | (bits)ALL(type, 1.0##suffix));  \
-    return select_##type(MASK((x > 0) | (x < 0)), x, one);                                        \
-  }                                                                                               \
   ONE type sqrt_##type(type x) {                                                                  \
     type r;                                                                                       \
     EACH r[lane] = __builtin_sqrt##suffix(x[lane]);                                               \
@@ -129,6 +115,12 @@ SELECT(u8, i8)
     type r;                                    \
     EACH r[lane] = function(x[lane], y[lane]); \
     return r;                                  \
+  }
+#define ROUNDED(type)                       \
+  APART type type##_of_f64(f64 x) {         \
+    type r;                                 \
+    EACH r[lane] = lane_of_##type(x[lane]); \
+    return r;                               \
   }
 #define EACH_LANE(name) UNARY(f64, name, name) UNARY(f32, name, name##f)
 FLOATS(f64, i64, )
@@ -156,41 +148,3 @@ FLOATS(f32, i32, f)
 #else
 #define FUNCTION(name) UNARY(f64, name, name) WHOLE_OF(f32, SINGLES, name, name##f)
 #endif
-
-// Operations of integers: division by zero gives -1, with the dividend as remainder.
-
-#define INTEGERS(type, scalar)                                                                       \
-  ONE type max_##type(type a, type b) { return select_##type(MASK(a > b), b, a); }                   \
-  ONE type min_##type(type a, type b) { return select_##type(MASK(a < b), b, a); }                   \
-  ONE type sign_##type(type x) { return (type)((x > 0) & 1) - (type)((x < 0) & 1); }                 \
-  ONE scalar lane_div_##type(scalar x, scalar y) { return !y ? -1 : y == (scalar)-1 && (scalar)-1 < 0 ? -x : x / y; } \
-  ONE scalar lane_rem_##type(scalar x, scalar y) { return !y ? x : y == (scalar)-1 && (scalar)-1 < 0 ? 0 : x % y; }   \
-  BINARY(type, div, lane_div_##type)                                                                 \
-  BINARY(type, rem, lane_rem_##type)
-INTEGERS(i64, int64_t)
-INTEGERS(i32, int32_t)
-INTEGERS(i16, int16_t)
-INTEGERS(i8, int8_t)
-INTEGERS(u64, uint64_t)
-INTEGERS(u32, uint32_t)
-INTEGERS(u16, uint16_t)
-INTEGERS(u8, uint8_t)
-
-// Floats to integers: towards zero, saturated; NaN gives 0.
-
-#define ROUNDED(to, scalar, least, most)                                                             \
-  APART to to##_of_f64(f64 x) {                                                                      \
-    to r;                                                                                            \
-    EACH r[lane] = x[lane] >= (double)(most) ? (most) : x[lane] <= (double)(least) ? (least)         \
-                   : x[lane] != x[lane] ? 0 : (scalar)x[lane];                                       \
-    return r;                                                                                        \
-  }                                                                                                  \
-  ONE to to##_of_f32(f32 x) { return to##_of_f64(AS(f64, x)); }
-ROUNDED(i64, int64_t, INT64_MIN, INT64_MAX)
-ROUNDED(i32, int32_t, INT32_MIN, INT32_MAX)
-ROUNDED(i16, int16_t, INT16_MIN, INT16_MAX)
-ROUNDED(i8, int8_t, INT8_MIN, INT8_MAX)
-ROUNDED(u64, uint64_t, 0, UINT64_MAX)
-ROUNDED(u32, uint32_t, 0, UINT32_MAX)
-ROUNDED(u16, uint16_t, 0, UINT16_MAX)
-ROUNDED(u8, uint8_t, 0, UINT8_MAX)

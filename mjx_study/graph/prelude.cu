@@ -54,12 +54,13 @@ ONE mask select_bool(mask m, mask no, mask yes) { return m ? yes : no; }
 #define KEEP(type, slot, value) (*(type *)(kept + (slot) * APART_IN_MEMORY) = (value))
 #define RECALL(type, slot) (*(const type *)(kept + (slot) * APART_IN_MEMORY))
 #define ENTRY LOAD
+#define LANE(type) type
 #define CONSTANTS(type) static __device__ const type
 #define TABLE(type, table, at) ((table)[at])
 #define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
 #define STORE_BOOL(place, at, value) STORE(u8, place, at, (value) & 1)
 
-// Operations of floats, as JAX defines them: extremes propagate NaN, signs keep zeros.
+// Operations of a lane.
 
 #define UNARY(type, name, function) \
   ONE type name##_##type(type x) { return function(x); }
@@ -67,36 +68,8 @@ ONE mask select_bool(mask m, mask no, mask yes) { return m ? yes : no; }
   ONE type name##_##type(type x, type y) { return function(x, y); }
 #define FUNCTION(name) UNARY(f64, name, name) UNARY(f32, name, name##f)
 #define EACH_LANE FUNCTION
-#define FLOATS(type)                                                                   \
-  SELECT(type)                                                                         \
-  ONE type max_##type(type a, type b) { return a > b || a != a ? a : b; }              \
-  ONE type min_##type(type a, type b) { return a < b || a != a ? a : b; }              \
-  ONE type sign_##type(type x) { return x > 0 ? (type)1 : x < 0 ? (type)-1 : x; }
-FLOATS(f64)
-FLOATS(f32)
+#define ROUNDED(type) \
+  ONE type type##_of_f64(f64 x) { return lane_of_##type(x); }
 UNARY(f64, abs, fabs)
 UNARY(f32, abs, fabsf)
 FUNCTION(sqrt)
-
-// Operations of integers: division by zero gives -1, with the dividend as remainder. Floats become integers towards
-// zero, saturated; NaN gives 0.
-
-#define INTEGERS(type, least, most)                                                                           \
-  SELECT(type)                                                                                                \
-  ONE type max_##type(type a, type b) { return a > b ? a : b; }                                               \
-  ONE type min_##type(type a, type b) { return a < b ? a : b; }                                               \
-  ONE type sign_##type(type x) { return (type)(x > 0) - (type)(x < 0); }                                      \
-  ONE type div_##type(type x, type y) { return !y ? -1 : y == (type)-1 && (type)-1 < 0 ? -x : x / y; }        \
-  ONE type rem_##type(type x, type y) { return !y ? x : y == (type)-1 && (type)-1 < 0 ? 0 : x % y; }          \
-  ONE type type##_of_f64(f64 x) {                                                                             \
-    return x >= (f64)(most) ? (most) : x <= (f64)(least) ? (least) : x != x ? 0 : (type)x;                    \
-  }                                                                                                           \
-  ONE type type##_of_f32(f32 x) { return type##_of_f64(x); }
-INTEGERS(i64, -9223372036854775807LL - 1, 9223372036854775807LL)
-INTEGERS(i32, -2147483647 - 1, 2147483647)
-INTEGERS(i16, -32768, 32767)
-INTEGERS(i8, -128, 127)
-INTEGERS(u64, 0, 18446744073709551615ULL)
-INTEGERS(u32, 0, 4294967295U)
-INTEGERS(u16, 0, 65535)
-INTEGERS(u8, 0, 255)
