@@ -1,5 +1,6 @@
 """Native code computes what JAX's operations do, for batches of any size, and does without where it must."""
 
+import concurrent.futures.thread
 import ctypes
 import os
 import shutil
@@ -295,6 +296,13 @@ def test_a_failing_compiler_is_reported_and_done_without(folder, monkeypatch, ca
     monkeypatch.setattr(native, "library_ready", lambda name: False)
     found = jax.jit(jax.vmap(lambda x: unrolled(lambda x: x**3 + 7, x)))(ROW)
     np.testing.assert_allclose(found, ROW**3 + 7)
+
+
+def test_a_process_that_ends_begins_no_compiler(folder, monkeypatch, capsys):
+    """And its threads say nothing."""
+    monkeypatch.setattr(concurrent.futures.thread, "_shutdown", True)
+    assert not build.library_ready(build.build_library(source(6.5)))
+    assert capsys.readouterr().err == ""
 
 
 def test_each_function_that_is_left_is_counted_once(monkeypatch):

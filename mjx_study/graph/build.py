@@ -133,6 +133,9 @@ def _finish(name: str, source: str, future: Future[Any]) -> None:
     found = None
     try:
         found = _cached(name) or _build(name, source)
+    except RuntimeError as error:
+        if "interpreter shutdown" not in str(error):  # no thread begins any more
+            raise
     finally:
         future.set_result(found)
 
