@@ -75,9 +75,9 @@ def compilations() -> Iterator[list[str]]:
     """Names of the programs that XLA compiles during a test."""
     names: list[str] = []
 
-    def compiled(event: str, *_: Any, fun_name: str = "", **__: Any) -> None:
+    def compiled(event: str, duration_secs: float, **named: Any) -> None:
         if event.endswith("backend_compile_duration"):
-            names.append(fun_name)
+            names.append(named["fun_name"])
 
     jax.monitoring.register_event_duration_secs_listener(compiled)
     yield names

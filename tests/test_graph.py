@@ -173,7 +173,8 @@ def _of_few_bits(x):
     )
 
 
-FUNCTIONS |= {"computed indices of large arrays": _looked_up, "indices of few bits": _of_few_bits}
+FUNCTIONS["computed indices of large arrays"] = _looked_up
+FUNCTIONS["indices of few bits"] = _of_few_bits
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

@@ -202,7 +202,10 @@ def interpreted(
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
 
     def read(atom: Any) -> Any:
-        return constant(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else values[atom]
+        if isinstance(atom, Literal):
+            kind: Any = atom.aval
+            return constant(np.asarray(atom.val, kind.dtype))
+        return values[atom]
 
     for equation in jaxpr.eqns:
         outputs = outputs_of(equation, [read(atom) for atom in equation.invars])
