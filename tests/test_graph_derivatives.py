@@ -1,6 +1,7 @@
 """Derivatives of graphs are JAX's derivatives of the functions, at kinks and special values, too."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ from mjx_study.graph.linear_map import derivative, implicit_derivative, implicit
 from mjx_study.graph.native import native_summary
 from mjx_study.graph.nodes import ELEMENTWISE, entries_of
 from mjx_study.graph.operation import applied, computed
+from mjx_study.graph.scalars import unrolled
 from mjx_study.simulation.linear_algebra import solve_positive_definite
 from tests.test_graph import descent
 from tests.test_second_derivatives import COMPOSITIONS
@@ -272,3 +274,11 @@ def test_the_implicit_derivative_is_that_of_the_loop() -> None:
     all_close(back, [of_x, of_force], 1e-11)
     (matrix,) = computed(implicit_jacobian(function, (0,), solve_positive_definite), [ROW, force, root])
     all_close(matrix, np.concatenate([over_x for over_x, _ in expected]), 1e-11)
+
+
+def test_changes_of_an_empty_array_have_its_type() -> None:
+    """As of the activations of a model without actuator dynamics, in 32 bits."""
+    given = jnp.ones(2, jnp.float32), jnp.zeros(0, jnp.float32)
+    function = partial(unrolled, lambda x, empty: (x * x, empty))
+    found = jax.jvp(function, given, given)[1], jax.vjp(function, *given)[1](given)
+    assert {each.dtype for each in jax.tree.leaves(found)} == {np.dtype("float32")}

@@ -19,6 +19,7 @@ from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import LinearFeedback
 from tests.carts import cart
+from tests.processes import run_script
 from tests.pusher_fixtures import HORIZON, NO_NOISE, SIGMA, cost, penalty, pusher_simulator, pusher_task, sample_keys
 
 ANY_CONTACT = ContactModel(jnp.array([-1.0, -1.0]), jnp.array([0.9, 0.9, 0.001, 0.5, 2.0]))
@@ -311,3 +312,27 @@ def longer() -> MjxObjective:
 def test_tasks_and_simulators_refuse(make, message: str):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+IN_32_BITS = """
+import jax, jax.numpy as jnp
+from mjx_study import configure
+configure(precision="float32")
+from tests.test_objective import without_noise
+print(*without_noise())
+"""
+
+
+def without_noise() -> np.ndarray:
+    """The pusher's gradient over four forces through a spring."""
+    task = make_task("pusher", horizon=4)
+    objective = Simulator(task.replace(sigma=1e-30), chunk_size=1).objective(penalty(100.0))
+    found = objective.differentiate(task.theta, jax.random.split(jax.random.key(0), 1)).gradient
+    assert found.dtype == task.theta.dtype
+    return np.asarray(found[0])
+
+
+def test_gradients_in_32_bits() -> None:
+    single = np.array(run_script(IN_32_BITS).stdout.split(), float)
+    double = without_noise()
+    assert 0 < np.max(np.abs(single / double - 1)) < 1e-4  # it is not the same to the last bit

@@ -76,8 +76,10 @@ def _differentiate(
     primals: Any, tangents: Any, *, jaxpr: ClosedJaxpr, rule: FlatRule, transpose: Transpose | None
 ) -> Any:
     value, changes = rule(primals, [None if type(each) is ad.Zero else each for each in tangents])
-    zero = [ad.Zero(each.to_tangent_aval()) for each in jaxpr.out_avals]
-    return value, [none if each is None else each for each, none in zip(changes, zero, strict=True)]
+    kinds = [each.to_tangent_aval() for each in jaxpr.out_avals]
+    return value, [
+        ad.Zero(kind) if each is None else _typed(each, kind) for each, kind in zip(changes, kinds, strict=True)
+    ]
 
 
 def _transpose(
@@ -85,7 +87,16 @@ def _transpose(
 ) -> list[Any]:
     assert transpose is not None
     fixed = [None if ad.is_undefined_primal(each) else each for each in arguments]
-    return transpose(fixed, [ad.instantiate_zeros(each) for each in adjoints])
+    found = transpose(fixed, [ad.instantiate_zeros(each) for each in adjoints])
+    return [
+        None if each is None else _typed(each, to.aval) if ad.is_undefined_primal(to) else each
+        for each, to in zip(found, arguments, strict=True)
+    ]
+
+
+def _typed(change: Any, kind: Any) -> Any:
+    """A change with its type, which entries of a graph do not tell of an empty array."""
+    return jax.lax.convert_element_type(change, kind.dtype)
 
 
 def _batch(arguments: Any, axes: Any, *, jaxpr: ClosedJaxpr, rule: FlatRule, transpose: Transpose | None) -> Any:
