@@ -102,6 +102,8 @@ def circulations(
     node, this compares a central difference of the mean cost with the estimator's mean at the midpoint.
 
     Args:
+        estimators: Estimators, each with a result of its own.
+        objective: Objective with the oracles that they need.
         start, end: Ends of the path, [param]; a few standard deviations of the noise apart, or less.
         key: Random key; consumed.
         num_samples: Samples at every node, >= 2; fewer are a ValueError.

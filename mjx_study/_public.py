@@ -27,11 +27,12 @@ from mjx_study.simulation.observation import ObservedState, observed
 from mjx_study.simulation.scene import Scene, SceneError, check_model, load_scene, put_scene
 from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS, make_task
+from mjx_study.tasks.network import Network
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
 from mjx_study.tasks.task import Recipe, StudyDefaults, Task
 
 __all__ = [
-    "ContactModel", "ContactWarning", "FAMILIES", "InitialStatePolicy", "LinearFeedback", "MjxObjective",
+    "ContactModel", "ContactWarning", "FAMILIES", "InitialStatePolicy", "LinearFeedback", "MjxObjective", "Network",
     "ObservedState", "OpenLoop", "Policy", "Recipe", "Scene", "SceneError", "Simulator", "State", "StudyAccessor",
     "StudyConfig", "StudyDefaults", "TASKS", "Task", "apply_contact", "check_model", "configure", "contact_model",
     "differentiable_mjx", "effective_mass", "estimators_of", "family_model", "initial_state", "load_scene",

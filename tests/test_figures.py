@@ -32,7 +32,7 @@ def study(kind: str, models: list[tuple[str, float]], seeds: int = 1, sigma=(0.1
     """A study whose numbers are all 0.5 unless changed, to what broadcasts over a variable's dimensions."""
     coords: dict[str, Any] = {
         "task": ["pusher"], "timestep": [TIMESTEP], "cone": ["pyramidal"], "sigma": list(sigma), "samples": [50],
-        "model": [f"{family} {stiffness:g}" for family, stiffness in models],
+        "model": [f"{family} {stiffness:g}" if stiffness else family for family, stiffness in models],
         "estimator": list(BOTH), "seed": range(seeds), "iteration": range(1, 41), "point": range(41),
     }  # fmt: skip
     sizes = {name: len(values) for name, values in coords.items()} | {"solref_entry": 2}

@@ -116,12 +116,13 @@ def plan_scene_gradcheck(
     states: int = CHECKED_STATES,
     stock: bool = False,
 ) -> GradcheckPlan:
-    """Plan a check of the steps of any scene; other arguments as for `plan_gradcheck`.
+    """Plan a check of the steps of any scene.
 
     Args:
         scene: the scene, in float64, with at least one degree of freedom.
         families: contact families; by default `mjcf`, or `mujoco` if a stiffness is given.
         stiffnesses: stiffnesses for families that take one [N/m].
+        seed, damping, smoothing, states, stock: as for `plan_gradcheck`.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
         horizon: number of steps of the rollout from which states are taken.
 

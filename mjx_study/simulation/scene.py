@@ -219,7 +219,7 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
         raise SceneError(
             f"{name} combines RK4 with contacts, limits, equalities or friction loss: RK4's stages would solve the "
             "constraints four times per step without an order to gain; set integrator to euler or implicitfast "
-            "in its <option>, or give --integrator euler"
+            "in its <option>, which alone counts for init, or give --integrator euler"
         )
     return scene
 
