@@ -104,7 +104,8 @@ def circulations(
     Args:
         estimators: Estimators, each with a result of its own.
         objective: Objective with the oracles that they need.
-        start, end: Ends of the path, [param]; a few standard deviations of the noise apart, or less.
+        start: Start of the path, [param].
+        end: End of the path, [param]; a few standard deviations of the noise from its start, or less.
         key: Random key; consumed.
         num_samples: Samples at every node, >= 2; fewer are a ValueError.
         nodes: Number of nodes, odd; an even one is a ValueError.

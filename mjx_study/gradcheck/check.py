@@ -122,9 +122,13 @@ def plan_scene_gradcheck(
         scene: the scene, in float64, with at least one degree of freedom.
         families: contact families; by default `mjcf`, or `mujoco` if a stiffness is given.
         stiffnesses: stiffnesses for families that take one [N/m].
-        seed, damping, smoothing, states, stock: as for `plan_gradcheck`.
+        seed: random seed of the states.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
+        damping: as for `plan_gradcheck`.
+        smoothing: as for `plan_gradcheck`.
         horizon: number of steps of the rollout from which states are taken.
+        states: number of states per contact model.
+        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as for `plan_gradcheck`, or a stiffness without a pair.
